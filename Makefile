@@ -1,0 +1,64 @@
+# Every target that needs the environment makes it first; it is made anew only when the lock or pyproject.toml changes.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+# Package index of PyTorch's CPU builds, for machines where pip would otherwise choose a CUDA build (README, Set-up).
+TORCH_INDEX ?=
+
+BIN := .venv/bin
+READY := .venv/.ready
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+LOCK_VENV := build/lock-venv
+
+.PHONY: help setup demo test lint types imports bench lock clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+
+setup: $(READY) ## make .venv with the locked versions
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "chargetune needs Python 3.11 or newer: make PYTHON=...")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(if $(TORCH_INDEX),$(PIP) install --quiet --no-deps --index-url $(TORCH_INDEX) "$$(grep '^torch==' requirements.lock)")
+	$(PIP) install --quiet --requirement requirements.lock
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: $(READY) ## tune a fast-charging controller and draw the figures, into out/demo
+	$(BIN)/chargetune tune examples/fast_charge.toml --out out/demo
+
+test: lint types imports ## every check, then every test
+	$(BIN)/python -m pytest -n 2
+
+lint: $(READY) ## ruff: rules and format
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(READY) ## mypy, strict
+	$(BIN)/mypy
+
+imports: $(READY) ## the directions of imports between the folders
+	$(BIN)/lint-imports
+
+bench: $(READY) ## speed of the closed loop and of the tuner
+	$(BIN)/python benchmarks/closed_loop.py
+	$(BIN)/python benchmarks/tuner_overhead.py
+
+# torch keeps the locked version: raise it by hand in requirements.lock, within the range of pyproject.toml.
+# CUDA libraries are left out, so that the lock serves both kinds of wheel.
+lock: ## renew requirements.lock from the ranges in pyproject.toml
+	rm -rf $(LOCK_VENV)
+	$(PYTHON) -m venv $(LOCK_VENV)
+	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)"
+	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench]'
+	{ grep '^#' requirements.lock; \
+	  $(LOCK_VENV)/bin/pip freeze --all --exclude-editable --exclude pip \
+	  | sed 's/+cpu$$//' | grep -Ev '^(cuda|nvidia|triton)'; } > build/requirements.lock
+	mv build/requirements.lock requirements.lock
+
+clean: ## remove the environment, caches and outputs
+	rm -rf .venv build dist out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
+	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +

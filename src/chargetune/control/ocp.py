@@ -1,0 +1,321 @@
+"""The controller's problem, discretised, condensed and scaled, as CasADi functions of run-time values only.
+
+The states are eliminated (single shooting); the inputs U = (u_0 .. u_{N-1}) remain. ``sweep`` rolls the model out and
+linearises it stage by stage; ``quadratic`` condenses that to a dense QP in the scaled step v = (U+ - U) / range and
+the scaled slacks; ``residual`` measures optimality from the same linearisation without condensing it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from chargetune.control.controller import Controller
+from chargetune.control.estimators import finite
+
+__all__ = ["Problem", "control_problem"]
+
+# Least curvature of an input relative to the mean; only the steps depend on it, not the solution.
+REGULARISATION = 1e-8
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A controller as CasADi functions.
+
+    prepare
+        (theta, setpoint, p_nominal) -> q, everything that is fixed over an episode (spline coefficients, weights):
+        no other function sees theta or p.
+    bounds
+        (now, q) -> (lower, upper), the input bounds repeated over the horizon, shapes (N nu,).
+    sweep
+        (now, U, q) -> (J, c, D): cost, scaled rows c(U) <= s, and the stages' derivatives packed in a vector.
+    quadratic
+        (U, c, D, lower, upper) -> (H, g, A, uba, lbx, ubx, span, gamma): the scaled QP, with dU = span v, cost gamma J.
+    residual
+        (U, c, D, multipliers, gamma, lower, upper) -> largest natural residual of the scaled optimality conditions.
+    merit
+        (J, c) -> phi, the cost with its exact penalties.
+    fallback
+        (now, q) -> input, shape (nu,), before clipping.
+    correct, predict
+        The estimator: (memory, y, u, q) -> (x_hat, memory); (x_hat, memory, u, q) -> memory.
+    groups
+        For each row the index of its limit.
+    """
+
+    controller: Controller
+    prepare: ca.Function
+    bounds: ca.Function
+    sweep: ca.Function
+    quadratic: ca.Function
+    residual: ca.Function
+    merit: ca.Function
+    fallback: ca.Function
+    correct: ca.Function
+    predict: ca.Function
+    groups: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of decision variables N nu."""
+        return int(self.sweep.size1_in(1))
+
+    @property
+    def variables(self) -> int:
+        """Variables of the QP: inputs and one slack a limit."""
+        return self.size + len(self.controller.limits)
+
+    @property
+    def row_width(self) -> int:
+        """Rows of c in one stage; the terminal rows follow after the last stage."""
+        return sum(limit.rows.size1_out(0) * (2 if limit.at == "both" else 1) for limit in self.controller.limits if limit.at != "terminal")
+
+
+def control_problem(controller: Controller) -> Problem:
+    """Turn a controller into CasADi functions."""
+    model, horizon, limits = controller.model, controller.horizon, controller.limits
+    nx, nu = len(model.states), len(model.inputs)
+    x, u, now = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("now", nx)
+    theta, setpoint = ca.SX.sym("theta", controller.theta.dimension), ca.SX.sym("setpoint", nx + nu)
+    nominal = ca.SX.sym("p", model.nominal.size)
+    memory = ca.SX.sym("memory", controller.estimator.initial(model, np.zeros(nx)).size)
+    signals = controller.estimator.signals(model)
+    y = ca.SX.sym("y", len(signals))
+
+    p = controller.parameters(theta, nominal)
+    after = model.f(x, u, p)
+    no_input = ca.SX(ca.DM.zeros(nu))
+
+    def rows(places: tuple[str, ...], state: Any, control: Any) -> Any:
+        return ca.vertcat(*(limit.rows(state, control, theta, p, now) / limit.scale for limit in limits if limit.at in places))
+
+    x_hat, corrected = controller.estimator.correct(model, memory, {n: y[i] for i, n in enumerate(signals)}, u, p)
+    expressions = [
+        after,
+        controller.stage_cost(x, u, theta, p, setpoint, now),
+        ca.vertcat(rows(("start", "both"), x, u), rows(("end", "both"), after, u)),
+        controller.terminal_cost(x, no_input, theta, p, setpoint, now),
+        rows(("terminal",), x, no_input),
+        controller.input_lower(theta, p, now),
+        controller.input_upper(theta, p, now),
+        controller.fallback(theta, p, now),
+        x_hat,
+        ca.SX(corrected),
+        ca.SX(controller.estimator.predict(model, x, memory, u, p)),
+    ]
+    # Everything that depends on theta and p alone is computed once an episode instead of at every stage.
+    found = ca.extract_parametric(expressions, ca.vertcat(theta, setpoint, nominal), {"extract_trivial": True})
+    expressions, symbols, values = found
+    q = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+    prepared = ca.cse(ca.vertcat(*values)) if values else ca.SX(0, 1)
+    after, stage_cost, stage_rows, final_cost, final_rows, lower, upper, fallback, x_hat, corrected, predicted = expressions
+
+    stage = _Linearisation.of(x, u, after, stage_cost, stage_rows)
+    final = _Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
+    groups = tuple(
+        [*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal")]
+    )
+    packed_stage = ca.Function("stage", [x, u, now, q], _cse(after, stage_cost, stage_rows, stage.packed))
+    packed_final = ca.Function("final", [x, now, q], _cse(final_cost, final_rows, final.packed))
+    return Problem(
+        controller=controller,
+        prepare=ca.Function("prepare", [theta, setpoint, nominal], [prepared]),
+        bounds=ca.Function("bounds", [now, q], [ca.repmat(lower, horizon, 1), ca.repmat(upper, horizon, 1)]),
+        sweep=_sweep(packed_stage, packed_final, horizon, nx, nu, q.shape[0]),
+        quadratic=_quadratic(controller, stage, final, groups),
+        residual=_residual(controller, stage, final, groups),
+        merit=_merit(controller, groups),
+        fallback=ca.Function("fallback", [now, q], [fallback]),
+        correct=ca.Function("correct", [memory, y, u, q], _cse(x_hat, corrected)),
+        predict=ca.Function("predict", [x, memory, u, q], _cse(predicted)),
+        groups=groups,
+    )
+
+
+def _cse(*expressions: Any) -> list[Any]:
+    return list(ca.cse([ca.densify(e) for e in expressions]))
+
+
+def _group(controller: Controller, *places: str) -> list[int]:
+    return [j for j, limit in enumerate(controller.limits) if limit.at in places for _ in range(limit.rows.size1_out(0))]
+
+
+@dataclass(frozen=True)
+class _Linearisation:
+    """Derivatives of one stage with respect to (x, u), as the non-zeros of sparse matrices packed in one vector."""
+
+    packed: Any
+    patterns: tuple[ca.Sparsity, ...]
+
+    @classmethod
+    def of(cls, x: Any, u: Any, after: Any, cost: Any, rows: Any) -> _Linearisation:
+        xu = ca.vertcat(x, u)
+        curvature, slope = ca.hessian(cost, xu)
+        nx = x.shape[0]
+        parts = [
+            ca.jacobian(after, x), ca.jacobian(after, u), ca.jacobian(rows, x), ca.jacobian(rows, u),
+            slope[:nx], slope[nx:], curvature[:nx, :nx], curvature[nx:, :nx], curvature[nx:, nx:],
+        ]  # fmt: skip
+        parts = [ca.sparsify(part) for part in parts]
+        return cls(ca.vertcat(*(ca.vertcat(*part.nonzeros()) for part in parts)), tuple(part.sparsity() for part in parts))
+
+    @property
+    def length(self) -> int:
+        return sum(pattern.nnz() for pattern in self.patterns)
+
+    def unpack(self, vector: Any) -> list[Any]:
+        """[f_x, f_u, c_x, c_u, l_x, l_u, l_xx, l_ux, l_uu] from the packed vector."""
+        out, start = [], 0
+        for pattern in self.patterns:
+            out.append(ca.SX(pattern, vector[start : start + pattern.nnz()]))
+            start += pattern.nnz()
+        return out
+
+
+def _sweep(stage: ca.Function, final: ca.Function, horizon: int, nx: int, nu: int, nq: int) -> ca.Function:
+    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", nq)
+    x, cost, rows, derivatives = now, ca.MX(0.0), [], []
+    for u in ca.vertsplit(inputs, nu):
+        x, stage_cost, row, packed = stage(x, u, now, q)
+        cost = cost + stage_cost
+        rows.append(row)
+        derivatives.append(packed)
+    final_cost, row, packed = final(x, now, q)
+    return ca.Function("sweep", [now, inputs, q], [cost + final_cost, ca.vertcat(*rows, row), ca.vertcat(*derivatives, packed)])
+
+
+def _violations(controller: Controller, groups: tuple[int, ...], rows: Any) -> list[Any]:
+    """s_j / scale_j, the largest violation of each limit over the horizon, at least 0."""
+    worst: list[Any] = [0.0] * len(controller.limits)
+    for i, j in enumerate(groups):
+        worst[j] = ca.if_else(rows[i] > worst[j], rows[i], worst[j])
+    return worst
+
+
+def _merit(controller: Controller, groups: tuple[int, ...]) -> ca.Function:
+    cost, rows = ca.SX.sym("J"), ca.SX.sym("c", len(groups))
+    merit = cost
+    for limit, s in zip(controller.limits, _violations(controller, groups, rows), strict=True):
+        merit += limit.penalty * limit.scale * (s + s**2 / 2)
+    # The running maximum drops a NaN; the sum keeps it, so that the line search refuses the point.
+    return ca.Function("merit", [cost, rows], [merit + 0 * ca.sum1(rows) if groups else merit])
+
+
+def _span(lower: Any, upper: Any) -> Any:
+    return ca.fmax(upper - lower, 1e-9 * (1 + ca.fabs(upper)))
+
+
+def _blocks(vector: Any, size: int) -> list[Any]:
+    return list(ca.vertsplit(vector, size)) if vector.shape[0] else []
+
+
+def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, horizon: int) -> tuple[list[list[Any]], list[Any]]:
+    n = stage.length
+    return [stage.unpack(vector[i * n : (i + 1) * n]) for i in range(horizon)], final.unpack(vector[horizon * n :])
+
+
+def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
+    horizon, limits = controller.horizon, controller.limits
+    nx, nu = len(controller.model.states), len(controller.model.inputs)
+    size = horizon * nu
+    inputs, lower, upper = (ca.SX.sym(n, size) for n in ("U", "lower", "upper"))
+    rows, vector = ca.SX.sym("c", len(groups)), ca.SX.sym("D", horizon * stage.length + final.length)
+    stages, last = _derivatives(vector, stage, final, horizon)
+    span = _span(lower, upper)
+    ranges = _blocks(span, nu)
+
+    # Forward: sensitivity[k] of the state to block k, and the rows' Jacobian from it.
+    sensitivity: list[Any] = []
+    history, jacobian = [], []
+    for i, (f_x, f_u, c_x, c_u, *_) in enumerate(stages):
+        scale = ca.diag(ranges[i])
+        history.append(list(sensitivity))
+        jacobian.append(ca.horzcat(*(ca.mtimes(c_x, s) for s in sensitivity), ca.mtimes(c_u, scale), ca.SX(c_x.shape[0], size - (i + 1) * nu)))
+        sensitivity = [*(ca.mtimes(f_x, s) for s in sensitivity), ca.mtimes(f_u, scale)]
+    jacobian.append(ca.horzcat(*(ca.mtimes(last[2], s) for s in sensitivity)))
+
+    # Backward: costates for the gradient, and for the Hessian one column of costates for each block of inputs.
+    hessian = ca.SX(size, size)
+    gradient: list[Any] = [None] * horizon
+    costate, columns = last[4], [ca.mtimes(last[6], s) for s in sensitivity]
+    for i in reversed(range(horizon)):
+        f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu = stages[i]
+        scale, own = ca.diag(ranges[i]), slice(i * nu, (i + 1) * nu)
+        gradient[i] = ca.mtimes(scale, l_u + ca.mtimes(f_u.T, costate))
+        costate = l_x + ca.mtimes(f_x.T, costate)
+        hessian[own, own] = ca.mtimes([scale, l_uu, scale]) + ca.mtimes([scale, f_u.T, columns[i]])
+        for k in range(i):
+            block = ca.mtimes(scale, ca.mtimes(f_u.T, columns[k]) + ca.mtimes(l_ux, history[i][k]))
+            hessian[own, k * nu : (k + 1) * nu] = block
+            hessian[k * nu : (k + 1) * nu, own] = block.T
+        columns = [ca.mtimes(f_x.T, columns[k]) + ca.mtimes(l_xx, history[i][k]) for k in range(i)]
+
+    mean = ca.sum1(ca.diag(ca.densify(hessian))) / size
+    gamma = 1 / ca.fmax(mean, 1e-12)
+    weights = gamma * ca.vertcat(*(limit.penalty * limit.scale for limit in limits)) if limits else ca.SX(0, 1)
+    choose = ca.SX(len(groups), len(limits))
+    for i, j in enumerate(groups):
+        choose[i, j] = -1
+    curved = gamma * hessian + REGULARISATION * ca.SX.eye(size)
+    unbounded = ca.SX(ca.DM(np.full(len(limits), np.inf)))
+    data = [
+        ca.diagcat(curved, ca.diag(weights)) if limits else curved,
+        ca.vertcat(gamma * ca.vertcat(*gradient), weights),
+        ca.horzcat(ca.vertcat(*jacobian), choose),
+        -rows,
+        ca.vertcat((lower - inputs) / span, ca.SX(ca.DM.zeros(len(limits)))),
+        ca.vertcat((upper - inputs) / span, unbounded),
+        span,
+        gamma,
+    ]
+    return ca.Function("quadratic", [inputs, rows, vector, lower, upper], _cse(*data))
+
+
+def _residual(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
+    """Natural residual at U with multipliers lambda >= 0 of the rows (all in the scaled problem).
+
+    stationarity      clip(-range gamma (g + A' lambda), (lower - U) / range, (upper - U) / range) is zero
+    complementarity   min(lambda_i, s_j - c_i) is zero with s_j = max(0, max c_i): an unused row has no multiplier
+    exactness         min(s_j, w_j (1 + s_j) - sum lambda) is zero: a violation only where the penalty is spent
+    """
+    horizon, nu = controller.horizon, len(controller.model.inputs)
+    size = horizon * nu
+    inputs, lower, upper = (ca.SX.sym(n, size) for n in ("U", "lower", "upper"))
+    rows, multipliers, gamma = ca.SX.sym("c", len(groups)), ca.SX.sym("lambda", len(groups)), ca.SX.sym("gamma")
+    vector = ca.SX.sym("D", horizon * stage.length + final.length)
+    stages, last = _derivatives(vector, stage, final, horizon)
+    span, width = _span(lower, upper), stages[0][2].shape[0]
+
+    costate = gamma * last[4] + ca.mtimes(last[2].T, multipliers[horizon * width :])
+    slopes: list[Any] = []
+    for i in reversed(range(horizon)):
+        f_x, f_u, c_x, c_u, l_x, l_u, *_ = stages[i]
+        own = multipliers[i * width : (i + 1) * width]
+        slopes.insert(0, gamma * l_u + ca.mtimes(c_u.T, own) + ca.mtimes(f_u.T, costate))
+        costate = gamma * l_x + ca.mtimes(c_x.T, own) + ca.mtimes(f_x.T, costate)
+    slope = ca.densify(ca.vertcat(*slopes)) * span
+    residuals = [ca.fabs(_least(_greatest(-slope, (lower - inputs) / span), (upper - inputs) / span))]
+    for j, (limit, s) in enumerate(zip(controller.limits, _violations(controller, groups, rows), strict=True)):
+        own_rows = [i for i, group in enumerate(groups) if group == j]
+        residuals += [ca.fabs(_least(multipliers[i], s - rows[i])) for i in own_rows]
+        total = sum((multipliers[i] for i in own_rows), ca.SX(0))
+        residuals.append(ca.fabs(_least(s, gamma * limit.scale * limit.penalty * (1 + s) - total)))
+    everything = ca.vertcat(*residuals)
+    worst: Any = 0.0
+    for k in range(everything.shape[0]):
+        worst = _greatest(worst, everything[k])
+    # A maximum drops a NaN; the sum keeps it.
+    worst = ca.if_else(finite(ca.sum1(everything)), worst, np.inf)
+    return ca.Function("residual", [inputs, rows, vector, multipliers, gamma, lower, upper], _cse(worst))
+
+
+def _least(a: Any, b: Any) -> Any:
+    return ca.if_else(a < b, a, b)
+
+
+def _greatest(a: Any, b: Any) -> Any:
+    return ca.if_else(a > b, a, b)

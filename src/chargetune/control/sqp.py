@@ -1,0 +1,131 @@
+"""The MPC's solver: Gauss-Newton SQP with an exact-penalty line search, one CasADi function for a whole control step.
+
+    min over U, s >= 0   phi = J(U) + sum_j w_j (s_j + s_j^2 / (2 scale_j))
+    s.t.                 lower <= U <= upper,   c_i(U) <= s_j(i)
+
+with one slack s_j for each limit over the whole horizon. Each iteration solves the QP of the linearised outputs and
+the stage costs' Hessians (curvature of the dynamics left out, gradient exact) with DAQP and goes the full step; while
+phi rises the step is halved. The first iterate is the shifted solution of the control step before. After each
+iteration the problem is linearised anew and optimality and feasibility are measured THERE, from multipliers and
+derivatives, independently of what the QP solver reports: a QP solver that is silently wrong cannot pass.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.control.estimators import finite
+from chargetune.control.ocp import Problem
+from chargetune.control.qp import QPSolver, daqp
+
+__all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
+
+# Of the scaled problem, where 1 is the whole range of an input or one `scale` of a limit: 1e-4 of 6 A is 0.6 mA.
+KKT_TOLERANCE = 1e-4
+HALVINGS_MAX = 6
+
+
+class SolveStatus(IntEnum):
+    """How a control step ended."""
+
+    CONVERGED = 0
+    NOT_CONVERGED = 1  # bounded input applied, but optimality or feasibility is not within tolerance
+    FALLBACK = 2  # the solver returned something non-finite: the declared fallback input was applied
+
+
+def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
+    """The solve of one control step: (now, warm, q) -> (U, warm_next, status, kkt, iterations).
+
+    U is finite and within the bounds whatever happened: status FALLBACK means that it is the fallback input repeated.
+    kkt is `Problem.residual` at U. ``warm`` is U and the QP's multipliers; `cold` makes the first one.
+    """
+    size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.prepare.size1_out(0), _duals(problem)
+    step = _iteration(problem, qp)
+    arguments = step.mx_in()
+    *point, dual, kkt = step(*arguments)
+    # Further iterations are nested branches, which cost nothing where the first iterate is a solution.
+    more = ca.Function("more", arguments, [point[0], dual, kkt, ca.MX(1.0)])
+    for _ in range(problem.controller.iterations_max - 1):
+        inputs = more.mx_in()
+        done = ca.Function("done", inputs, [inputs[1], inputs[5], ca.MX(0.0), ca.MX(0.0)])
+        # A NaN is not converged either, hence the negation.
+        unfinished = ca.logic_not(kkt <= KKT_TOLERANCE)
+        again = ca.Function.if_else("again", more, done)
+        last, last_dual, last_kkt, count = again(unfinished, arguments[0], *point, dual, *arguments[6:])
+        more = ca.Function("more", arguments, [last, last_dual, ca.if_else(unfinished, last_kkt, kkt), count + 1])
+
+    now, warm, q = ca.MX.sym("now", nx), ca.MX.sym("warm", size + duals), ca.MX.sym("q", nq)
+    # Bounds may depend on the estimate; they must stay numbers when it is not one.
+    known = ca.if_else(finite(ca.sum1(ca.fabs(now))), now, ca.DM.zeros(nx))
+    lower, upper = problem.bounds(known, q)
+    start = ca.fmin(ca.fmax(warm[:size], lower), upper)
+    cost, rows, derivatives = problem.sweep(now, start, q)
+    found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), warm[size:], lower, upper, q)
+    usable = finite(ca.sum1(ca.fabs(found)))
+    declared = ca.repmat(problem.fallback(known, q), problem.controller.horizon, 1)
+    bounded = ca.fmin(ca.fmax(ca.if_else(usable, found, declared), lower), upper)
+    status = ca.if_else(usable, ca.if_else(kkt <= KKT_TOLERANCE, SolveStatus.CONVERGED, SolveStatus.NOT_CONVERGED), SolveStatus.FALLBACK)
+    usable_dual = ca.if_else(finite(ca.sum1(ca.fabs(dual))), dual, ca.DM.zeros(duals))
+    following = ca.vertcat(bounded, usable_dual)[_shift(problem)]
+    names = ["U", "warm_next", "status", "kkt", "iterations"]
+    return ca.Function("solver", [now, warm, q], [bounded, following, status, kkt, count], ["now", "warm", "q"], names)
+
+
+def cold(problem: Problem, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The first ``warm`` of `solver`: one input vector, shape (nu,), repeated over the horizon, nothing active."""
+    return np.concatenate([np.tile(inputs, problem.controller.horizon), np.zeros(_duals(problem))])
+
+
+def _duals(problem: Problem) -> int:
+    return problem.variables + len(problem.groups)
+
+
+def _shift(problem: Problem) -> list[int]:
+    """Where each entry of the next ``warm`` stands in this one: a stage later, the last stage repeated."""
+    nu, horizon, size = len(problem.controller.model.inputs), problem.controller.horizon, problem.size
+    width = problem.row_width
+
+    def later(offset: int, block: int) -> list[int]:
+        return [offset + min(i + 1, horizon - 1) * block + k for i in range(horizon) for k in range(block)]
+
+    first_row = size + problem.variables
+    terminal = range(first_row + horizon * width, first_row + len(problem.groups))
+    return [*later(0, nu), *later(size, nu), *range(2 * size, first_row), *later(first_row, width), *terminal]
+
+
+def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
+    """One SQP iteration: (now, U, c, D, merit, dual, lower, upper, q) -> (U, c, D, merit, dual, kkt) at the next U."""
+    nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
+    now, inputs, c, derivatives = (ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2))))
+    merit, dual, q = ca.MX.sym("merit"), ca.MX.sym("dual", _duals(problem)), ca.MX.sym("q", nq)
+    lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
+    *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper)
+    solution, new_dual = qp(problem.variables, rows)(*data, dual)
+    # What phi may rise by is below the solver's tolerance in the scaled cost.
+    allowed = merit + KKT_TOLERANCE**2 / gamma
+    point = list(_line_search(problem)(now, inputs, span * solution[: problem.size], 1.0, allowed, q))
+    kkt = problem.residual(*point[:3], new_dual[problem.variables :], gamma, lower, upper)
+    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q], [*point, new_dual, kkt])
+
+
+def _line_search(problem: Problem) -> ca.Function:
+    """(now, U, d, length, allowed, q) -> (U, c, D, phi) at U + length d, the length halved while phi > allowed."""
+    sizes = {"now": problem.sweep.size1_in(0), "U": problem.size, "d": problem.size, "length": 1, "allowed": 1, "q": problem.prepare.size1_out(0)}
+    arguments = [ca.MX.sym(name, rows) for name, rows in sizes.items()]
+    now, base, direction, length, allowed, q = arguments
+
+    where = base + length * direction
+    cost, rows, derivatives = problem.sweep(now, where, q)
+    trial = [where, rows, derivatives, problem.merit(cost, rows)]
+    search = ca.Function("search", arguments, trial)
+    for _ in range(HALVINGS_MAX):
+        kept = [ca.MX.sym("kept", *t.shape) for t in trial]
+        keep = ca.Function("keep", [*arguments, *kept], kept)
+        shorter = ca.Function("shorter", [*arguments, *kept], search(now, base, direction, length / 2, allowed, q))
+        branch = ca.Function.if_else("halve", shorter, keep)
+        search = ca.Function("search", arguments, branch(ca.logic_not(trial[-1] <= allowed), *arguments, *trial))
+    return search

@@ -1,0 +1,37 @@
+"""Score: what one episode was worth, and how far it went beyond each limit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+__all__ = ["Score"]
+
+
+@dataclass(frozen=True)
+class Score:
+    """The verdict on one closed-loop episode.
+
+    objective
+        To be maximised; finite. What a constrained tuner improves, penalties not included.
+    performance
+        The scalar G(theta) of the paper's Algorithm 1, penalties included; finite.
+    excess
+        For each limit the worst signed excess over the episode in the unit of the limit:
+        positive is a violation, negative the smallest distance that was kept.
+    tolerance
+        For each limit the excess still called "kept" (measurement resolution, solver tolerance), same unit.
+    metrics
+        Named figures with the unit in the name (``t80_min``); None where the episode never got there.
+    """
+
+    objective: float
+    performance: float
+    excess: Mapping[str, float]
+    tolerance: Mapping[str, float]
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every limit was kept within its tolerance."""
+        return all(value <= self.tolerance.get(name, 0.0) for name, value in self.excess.items())

@@ -1,0 +1,172 @@
+"""Model: a discrete-time system x+ = f(x, u, p), y = h(x, u, p) in CasADi expressions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Model", "Named", "Signal"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A named scalar with its unit."""
+
+    name: str
+    unit: str = "1"
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise ValueError(f"signal name {self.name!r}: allowed are letters, digits and underscores, not starting with a digit")
+
+
+class Named(Mapping[str, Any]):
+    """A CasADi column vector whose entries (or blocks) are read by name: ``x["soc"]``."""
+
+    def __init__(self, blocks: Mapping[str, int], vector: Any) -> None:
+        self.vector = vector
+        self._slices: dict[str, slice] = {}
+        start = 0
+        for name, size in blocks.items():
+            self._slices[name] = slice(start, start + size)
+            start += size
+        if vector.shape[0] != start:
+            raise ValueError(f"vector has {vector.shape[0]} rows, expected {start} for {', '.join(blocks)}")
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._slices:
+            raise KeyError(f"unknown name {name!r}, allowed are {', '.join(self._slices) or '(none)'}")
+        return self.vector[self._slices[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._slices)
+
+    def __len__(self) -> int:
+        return len(self._slices)
+
+
+Equations = Callable[[Named, Named, Named], tuple[Mapping[str, Any], Mapping[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A discrete-time system; every number in it that a person may change is a run-time parameter p.
+
+    f
+        CasADi function (x, u, p) -> x at the next sampling instant, shapes (nx,), (nu,), (np,) -> (nx,).
+    h
+        CasADi function (x, u, p) -> y, shape (ny,). It has direct feedthrough in general, so an output has two
+        values in an interval: h(x_k, u_k) just after the input jumps and h(x_{k+1}, u_k) just before it jumps again.
+    parameters
+        Name and nominal values of each block of p, in order.
+    """
+
+    name: str
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    parameters: tuple[tuple[str, tuple[float, ...]], ...]
+    sampling_time_s: float
+    f: ca.Function
+    h: ca.Function
+
+    def __post_init__(self) -> None:
+        if not _positive(self.sampling_time_s):
+            raise ValueError(f"model {self.name}: sampling_time_s = {self.sampling_time_s!r}, allowed is a finite number > 0")
+        for field, minimum in (("states", 1), ("inputs", 1), ("outputs", 0)):
+            names = [s.name for s in getattr(self, field)]
+            if len(names) < minimum or len(set(names)) != len(names):
+                raise ValueError(f"model {self.name}: {field} = {names}, allowed are at least {minimum} different names")
+        for name, values in self.parameters:
+            if not all(math.isfinite(v) for v in values):
+                raise ValueError(f"model {self.name}: parameter {name} = {list(values)}, allowed are finite numbers")
+
+    @classmethod
+    def build(
+        cls,
+        name: str,
+        *,
+        states: Sequence[Signal],
+        inputs: Sequence[Signal],
+        outputs: Sequence[Signal],
+        parameters: Mapping[str, ArrayLike],
+        sampling_time_s: float,
+        equations: Equations,
+    ) -> Model:
+        """Make a model from a Python function of named CasADi symbols.
+
+        ``equations(x, u, p)`` returns two mappings: next value of every state and value of every output.
+        Raises ValueError when a state or output is missing or unknown.
+        """
+        blocks = {key: np.atleast_1d(np.asarray(value, dtype=float)) for key, value in parameters.items()}
+        x = ca.SX.sym("x", len(states))
+        u = ca.SX.sym("u", len(inputs))
+        p = ca.SX.sym("p", sum(v.size for v in blocks.values()))
+        nxt, out = equations(
+            Named({s.name: 1 for s in states}, x),
+            Named({s.name: 1 for s in inputs}, u),
+            Named({key: v.size for key, v in blocks.items()}, p),
+        )
+        f = ca.Function("f", [x, u, p], [_stack(nxt, states, f"model {name}: next states")], ["x", "u", "p"], ["x_next"])
+        h = ca.Function("h", [x, u, p], [_stack(out, outputs, f"model {name}: outputs")], ["x", "u", "p"], ["y"])
+        return cls(
+            name=name,
+            states=tuple(states),
+            inputs=tuple(inputs),
+            outputs=tuple(outputs),
+            parameters=tuple((key, tuple(float(v) for v in value)) for key, value in blocks.items()),
+            sampling_time_s=sampling_time_s,
+            f=f,
+            h=h,
+        )
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return tuple(s.name for s in self.states)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return tuple(s.name for s in self.inputs)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        return tuple(s.name for s in self.outputs)
+
+    @property
+    def parameter_blocks(self) -> dict[str, int]:
+        return {name: len(values) for name, values in self.parameters}
+
+    @property
+    def nominal(self) -> NDArray[np.float64]:
+        """p as a vector, shape (np,)."""
+        return np.array([v for _, values in self.parameters for v in values])
+
+    def with_parameters(self, **blocks: ArrayLike) -> Model:
+        """The same equations with other nominal values of p; ValueError names an unknown block or a wrong length."""
+        new = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in blocks.items()}
+        sizes = self.parameter_blocks
+        for name, value in new.items():
+            if name not in sizes:
+                raise ValueError(f"model {self.name}: unknown parameter {name!r}, allowed are {', '.join(sizes)}")
+            if value.shape != (sizes[name],):
+                raise ValueError(f"model {self.name}: parameter {name} has shape {value.shape}, expected ({sizes[name]},)")
+        merged = tuple((name, tuple(float(v) for v in new.get(name, np.array(values)))) for name, values in self.parameters)
+        return Model(self.name, self.states, self.inputs, self.outputs, merged, self.sampling_time_s, self.f, self.h)
+
+
+def _stack(values: Mapping[str, Any], signals: Sequence[Signal], where: str) -> Any:
+    names = [s.name for s in signals]
+    if set(values) != set(names):
+        missing, unknown = sorted(set(names) - set(values)), sorted(set(values) - set(names))
+        raise ValueError(f"{where}: missing {missing}, unknown {unknown}; expected exactly {names}")
+    return ca.vertcat(*(values[n] for n in names)) if names else ca.SX(0, 1)
+
+
+def _positive(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0

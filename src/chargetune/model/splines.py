@@ -1,0 +1,86 @@
+"""Cubic tables whose node values may be numbers or CasADi parameters.
+
+Both kinds are written as truncated powers,
+
+    s(z) = a + b (z - z_0) + sum_j e_j max(0, z - z_j)^2 + d_j max(0, z - z_j)^3,
+
+so that there is no interval search: the expression differentiates, compiles and stays defined outside the nodes, where
+it goes on as a straight line. For the natural spline a, b, d are linear in the node values (e = 0), which lets theta
+be a node value at run time. The monotone PCHIP slopes are not linear in the values, so PCHIP takes numbers only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+__all__ = ["natural_spline", "natural_spline_matrix", "pchip"]
+
+
+def natural_spline_matrix(nodes: ArrayLike) -> NDArray[np.float64]:
+    """Matrix M, shape (n+2, n), with coefficients [a, b, d_0 .. d_{n-1}] = M @ values of the natural cubic spline."""
+    z = _check_nodes(nodes)
+    if z.size == 2:
+        slope = np.array([-1.0, 1.0]) / (z[1] - z[0])
+        return np.vstack([[1.0, 0.0], slope, np.zeros((2, 2))])
+    spline = CubicSpline(z, np.eye(z.size), bc_type="natural")
+    cubic = spline.c[0]
+    jumps = np.diff(np.vstack([np.zeros((1, z.size)), cubic, np.zeros((1, z.size))]), axis=0)
+    return np.vstack([np.eye(z.size)[0], spline.c[2, 0], jumps])
+
+
+def natural_spline(z: Any, nodes: ArrayLike, values: Any) -> Any:
+    """Natural cubic spline through (nodes, values) at the CasADi expression z; values (n,) numbers or expressions.
+
+    Twice continuously differentiable; straight lines outside the nodes. Source: de Boor, A Practical Guide to Splines.
+    """
+    grid = _check_nodes(nodes)
+    column = ca.SX(values) if not isinstance(values, ca.MX) else values
+    if column.shape != (grid.size, 1):
+        raise ValueError(f"spline values have shape {column.shape}, expected ({grid.size}, 1), one a node")
+    coefficients = ca.mtimes(ca.DM(natural_spline_matrix(grid)), column)
+    out = coefficients[0] + coefficients[1] * (z - grid[0])
+    for j, node in enumerate(grid):
+        t = _positive_part(z - node)
+        out += coefficients[2 + j] * (t * t * t)
+    return out
+
+
+def pchip(z: Any, nodes: ArrayLike, values: ArrayLike) -> Any:
+    """Monotone cubic (PCHIP) through numbers (nodes, values) at the CasADi expression z.
+
+    Once continuously differentiable and monotone where the data are; straight lines outside the nodes.
+    Source: Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984), as in SciPy.
+    """
+    grid, table = _check_nodes(nodes), np.asarray(values, dtype=float)
+    if table.shape != grid.shape or not np.all(np.isfinite(table)):
+        raise ValueError(f"spline values have shape {table.shape}, expected {grid.shape} finite numbers")
+    interpolant = PchipInterpolator(grid, table)
+    slope = interpolant.derivative()(grid)
+    curve = np.append(interpolant.c[1], 0.0)
+    cubic = np.append(interpolant.c[0], 0.0)
+    out = table[0] + slope[0] * (z - grid[0])
+    width = np.append(np.nan, np.diff(grid))
+    for j, node in enumerate(grid):
+        t = _positive_part(z - node)
+        # Coefficients of this piece less those of the piece before, both written about this node.
+        square = curve[j] - (curve[j - 1] + 3 * cubic[j - 1] * width[j] if j else 0.0)
+        cube = cubic[j] - (cubic[j - 1] if j else 0.0)
+        out += (square + cube * t) * (t * t)
+    return out
+
+
+def _positive_part(t: Any) -> Any:
+    # Compiles to a compare and a mask; fmax becomes a call of the C library because of its rules for NaN.
+    return ca.if_else(t > 0, t, 0)
+
+
+def _check_nodes(nodes: ArrayLike) -> NDArray[np.float64]:
+    z = np.asarray(nodes, dtype=float)
+    if z.ndim != 1 or z.size < 2 or not np.all(np.isfinite(z)) or not np.all(np.diff(z) > 0):
+        raise ValueError(f"spline nodes = {z.tolist()}, allowed are at least 2 finite, strictly increasing numbers")
+    return z

@@ -1,0 +1,110 @@
+"""A `Model` with its own parameters as plant, with imperfect sensors and process noise."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.model.model import Model, Signal
+from chargetune.plants.plant import Measurement, PlantError
+from chargetune.plants.sensors import Sensors
+
+__all__ = ["SimulatedPlant", "disturbances"]
+
+
+def disturbances(plant: SimulatedPlant, steps: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(additive sensor errors (steps + 1, 2, ny), process noise (steps, nx)) of an episode with this seed.
+
+    Row 0 of the sensor errors belongs to the measurement at rest before the first interval. A longer episode begins
+    with the same numbers as a shorter one.
+    """
+    sensor_stream, process_stream = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
+    sd, bias, _ = plant.sensors.vectors(plant.outputs)
+    errors = bias + sd * sensor_stream.standard_normal((steps + 1, 2, len(plant.outputs)))
+    process = plant.process_sd * process_stream.standard_normal((steps, len(plant.model.states)))
+    return errors, process
+
+
+@dataclass
+class SimulatedPlant:
+    """x+ = f(x, u, p) + process noise, y = h(x, u, p), measured through `Sensors`; p are the plant's own parameters."""
+
+    model: Model
+    start: Mapping[str, float]
+    sensors: Sensors = field(default_factory=Sensors)
+    process_noise_sd: Mapping[str, float] = field(default_factory=dict)
+    _state: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros(0))
+    _seed: int = field(init=False, repr=False, compare=False, default=0)
+    _step: int = field(init=False, repr=False, compare=False, default=0)
+    _sent: deque[NDArray[np.float64]] = field(init=False, repr=False, compare=False, default_factory=deque)
+    _errors: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros((0, 2, 0)))
+    _process: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        for label, names in (("start", self.start), ("process_noise_sd", self.process_noise_sd)):
+            unknown = sorted(set(names) - set(self.model.state_names))
+            if unknown:
+                raise ValueError(f"plant: {label} names unknown {unknown}, allowed are {', '.join(self.model.state_names)}")
+            for name, value in names.items():
+                if not np.isfinite(value) or (label == "process_noise_sd" and value < 0):
+                    raise ValueError(f"plant: {label} of {name} = {value!r}, allowed is a finite number{' >= 0' if 'sd' in label else ''}")
+        self.sensors.vectors(self.outputs)
+
+    @property
+    def inputs(self) -> tuple[Signal, ...]:
+        return self.model.inputs
+
+    @property
+    def outputs(self) -> tuple[Signal, ...]:
+        return self.model.outputs
+
+    @property
+    def sampling_time_s(self) -> float:
+        return self.model.sampling_time_s
+
+    @property
+    def start_state(self) -> NDArray[np.float64]:
+        return np.array([float(self.start.get(n, 0.0)) for n in self.model.state_names])
+
+    @property
+    def process_sd(self) -> NDArray[np.float64]:
+        return np.array([float(self.process_noise_sd.get(n, 0.0)) for n in self.model.state_names])
+
+    def reset(self, seed: int) -> Measurement:
+        self._state, self._seed, self._step = self.start_state, seed, 0
+        self._draw(512)
+        rest = np.array(self.model.h(self._state, np.zeros(len(self.inputs)), self.model.nominal)).ravel()
+        start, end = self._measure(rest, rest)
+        self._sent = deque([end] * (self.sensors.delay_steps + 1), maxlen=self.sensors.delay_steps + 1)
+        return Measurement(start, end, self._sent[0], rest, rest, self._state)
+
+    def step(self, u: NDArray[np.float64]) -> Measurement:
+        p = self.model.nominal
+        before = np.array(self.model.h(self._state, u, p)).ravel()
+        if self._step >= len(self._process):
+            self._draw(2 * len(self._process))
+        noise = self._process[self._step]
+        self._state = np.array(self.model.f(self._state, u, p)).ravel() + noise
+        after = np.array(self.model.h(self._state, u, p)).ravel()
+        if not np.all(np.isfinite(self._state)):
+            raise PlantError(f"the plant's state is not finite after step {self._step}: {self._state.tolist()}")
+        self._step += 1
+        start, end = self._measure(before, after)
+        self._sent.append(end)
+        return Measurement(start, end, self._sent[0], before, after, self._state)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _draw(self, steps: int) -> None:
+        self._errors, self._process = disturbances(self, steps, self._seed)
+
+    def _measure(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        _, _, resolution = self.sensors.vectors(self.outputs)
+        raw = np.array([before, after]) + self._errors[self._step]
+        rounded = np.where(resolution > 0, np.floor(raw / np.where(resolution > 0, resolution, 1.0) + 0.5) * resolution, raw)
+        return rounded[0], rounded[1]

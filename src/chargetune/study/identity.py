@@ -1,0 +1,63 @@
+"""Identity of a study: everything that decides which trials it gets, compared when it is resumed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from chargetune.model.parameters import ParameterSpace
+from chargetune.study.document import canonical_json, describe, differences, space_to_json
+from chargetune.study.store import StudyRecord
+
+__all__ = ["StudyError", "check_change", "study_identity"]
+
+NAME = re.compile(r"[^\W_](?:[\w .,+=:@()-]{0,98}[\w.,+=:@()-])?")
+SHOWN = 12
+
+
+class StudyError(Exception):
+    """A study cannot begin, resume or go on; the message says why and what can be done."""
+
+
+def study_identity(name: str, *, config: Mapping[str, Any], space: ParameterSpace, tuner: object, seed: int, batch: int) -> dict[str, Any]:
+    """The identity as JSON data. Raises ValueError naming the argument, its value and what is allowed."""
+    if not NAME.fullmatch(name):
+        raise ValueError(
+            f"study name = {name!r}, allowed are 1 to 100 letters, digits, spaces and _ . , + = : @ ( ) -, first a letter or digit"
+        )
+    for field, value, least in (("seed", seed, 0), ("batch", batch, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{field} = {value!r}, allowed is an integer >= {least}")
+    if space.dimension == 0:
+        raise ValueError("space: no parameters, allowed is at least one")
+    identity = {"config": config, "space": space_to_json(space), "tuner": describe(tuner), "seed": seed, "batch": batch}
+    plain: dict[str, Any] = json.loads(canonical_json(identity, "study"))
+    return plain
+
+
+def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_changed: bool) -> None:
+    """StudyError that lists what differs between the stored study and ``identity``, unless that is accepted.
+
+    Other names, sizes or units of the parameters are never accepted: the stored thetas would mean something else.
+    """
+    old, new = _parameters(record.identity), _parameters(identity)
+    if old != new:
+        raise StudyError(
+            f"study {record.name!r} tunes other parameters: {', '.join(old)} -> {', '.join(new)};"
+            " its trials do not fit, begin a study with another name"
+        )
+    if accept_changed:
+        return
+    lines = differences(dict(record.identity), dict(identity))
+    shown = "".join(f"\n  {line}" for line in lines[:SHOWN]) + (f"\n  and {len(lines) - SHOWN} more" if len(lines) > SHOWN else "")
+    raise StudyError(
+        f"study {record.name!r} was begun with something else:{shown}\n"
+        "Undo the change, begin a study with another name, or resume with accept_changed=True"
+    )
+
+
+def _parameters(identity: Mapping[str, Any]) -> list[str]:
+    parameters: Sequence[Mapping[str, Any]] = identity["space"]
+    return [f"{p['name']} ({p['size']} x {p['unit']})" for p in parameters]

@@ -1,0 +1,234 @@
+"""Study: ask, tell, fail, run, resume. Its life is in the store; this object only holds the way to it."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import closing
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.episode.score import Score
+from chargetune.model.parameters import ParameterSpace
+from chargetune.study.document import score_to_json
+from chargetune.study.evaluation import Evaluate, trial_seed
+from chargetune.study.identity import StudyError, check_change, study_identity
+from chargetune.study.lease import Lease, take_lease
+from chargetune.study.provenance import utc_now, versions
+from chargetune.study.runner import WorkerError, check_crosses, outcomes
+from chargetune.study.store import Store, StoreError, StudyRecord
+from chargetune.study.trace import Traceable, encode
+from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
+
+__all__ = ["Proposer", "Study", "StudyError", "WorkerError"]
+
+
+class Proposer(Protocol):
+    """A tuner: a pure function of space, trials and n. Same arguments, same thetas, bit for bit."""
+
+    def ask(self, space: ParameterSpace, trials: Sequence[Trial], n: int = 1) -> NDArray[np.float64]:
+        """``n`` thetas inside the bounds, shape (n, d). Running trials are pending points."""
+        ...
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study in a store, held by this process until `close`. Made by `create_or_resume`.
+
+    Trials belong to batches of ``batch`` consecutive numbers, beginning with 0. In `run` a batch is proposed from the trials of
+    the batches before it and from nothing else, when all of them are told. So the trials depend on neither the number of workers,
+    nor the order in which they finish, nor interruptions, nor on how often ``trials`` was raised.
+    """
+
+    store: Store
+    record: StudyRecord
+    space: ParameterSpace
+    tuner: Proposer
+    seed: int
+    batch: int
+    lease: Lease
+
+    @classmethod
+    def create_or_resume(
+        cls,
+        store: Store,
+        name: str,
+        *,
+        config: Mapping[str, Any],
+        space: ParameterSpace,
+        tuner: Proposer,
+        seed: int = 0,
+        batch: int = 1,
+        accept_changed: bool = False,
+    ) -> Self:
+        """The study ``name`` of the store, begun if there is none.
+
+        config
+            JSON data that says what an evaluation does. It is compared on resume, together with space, tuner, seed and batch.
+        accept_changed
+            Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units.
+
+        Raises ValueError for bad arguments; StudyError when what is resumed differs, or when another process holds the study.
+        """
+        identity = study_identity(name, config=config, space=space, tuner=tuner, seed=seed, batch=batch)
+        record = next((r for r in store.studies() if r.name == name), None) or store.add_study(name, identity)
+        lease = _take_lease(store, record)
+        try:
+            record = store.study(name)
+            if record.identity != identity:
+                check_change(record, identity, accept_changed=accept_changed)
+                store.change_study(record.id, identity)
+                record = store.study(name)
+            store.note_holder(record.id, os.getpid(), socket.gethostname())
+        except BaseException:
+            lease.release()
+            raise
+        return cls(store, record, space, tuner, seed, batch, lease)
+
+    def close(self) -> None:
+        """Give the study back, so that another process can go on with it. The store stays open."""
+        self.lease.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def trials(self) -> list[Trial]:
+        """All trials by number, those that are running included."""
+        return self.store.trials(self.record.id)
+
+    def running(self) -> list[Trial]:
+        """Trials that were asked for and are not told. After a crash these are the ones to evaluate again."""
+        return [t for t in self.trials() if t.status is TrialStatus.RUNNING]
+
+    def best(self) -> Trial | None:
+        """The trial of the largest objective that kept every limit."""
+        return best_feasible(self.trials())
+
+    def best_performance(self) -> Trial | None:
+        """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
+        return best_performance(self.trials())
+
+    def trace(self, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
+        """Arrays and metadata of a trial's episode, None when none was stored."""
+        return self.store.trace(self.record.id, number)
+
+    def ask(self, n: int = 1) -> list[Trial]:
+        """The next ``n`` trials, proposed from all trials so far, and recorded as running before this returns.
+
+        Telling each batch before asking for the next one, ``ask(batch)``, gives the same trials as `run`.
+        """
+        if isinstance(n, bool) or not isinstance(n, int) or n < 1:
+            raise ValueError(f"n = {n!r}, allowed is an integer >= 1")
+        trials = self.trials()
+        return self._record(len(trials), self._propose(trials, n))
+
+    def ask_batch(self, limit: int) -> list[Trial]:
+        """The rest of the next batch up to trial number ``limit - 1``, as `run` asks; empty when there are ``limit`` trials.
+
+        Raises StudyError while a trial of an earlier batch is running.
+        """
+        trials = self.trials()
+        first = len(trials) - len(trials) % self.batch
+        count = min(first + self.batch, limit) - len(trials)
+        if count <= 0:
+            return []
+        before = trials[:first]
+        waiting = [t.number for t in before if t.status is TrialStatus.RUNNING]
+        if waiting:
+            raise StudyError(f"the trials {waiting} are not told, the next batch is proposed when they are")
+        # A batch that was cut by an earlier limit is proposed again as a whole: the tuner is a pure function.
+        thetas = self._propose(before, self.batch)[len(trials) - first :]
+        return self._record(len(trials), thetas[:count])
+
+    def tell(self, number: int, score: Score, episode: Traceable | None = None, *, ending: str = "done") -> Trial:
+        """Record the score of a running trial and its trace in one transaction. Telling the same again changes nothing.
+
+        Raises ValueError for a score with anything but finite numbers; StoreError for an unknown trial or a different second result.
+        """
+        score_to_json(score)
+        return self.finish(number, score, None if episode is None else encode(episode.arrays(), episode.meta()), ending)
+
+    def fail(self, number: int, reason: str, episode: Traceable | None = None) -> Trial:
+        """Record that a running trial failed, why, and what trace there is. As safe to repeat as `tell`."""
+        return self.finish(number, None, None if episode is None else encode(episode.arrays(), episode.meta()), reason)
+
+    def finish(self, number: int, score: Score | None, trace: bytes | None, ending: str) -> Trial:
+        """Record an outcome whose trace is encoded already; no score means that the trial failed."""
+        if not isinstance(ending, str) or not ending:
+            raise ValueError(f"ending = {ending!r}, allowed is a non-empty string")
+        return self.store.finish_trial(self.record.id, number, score=score, ending=ending, trace=trace, provenance=self._provenance())
+
+    def run(
+        self,
+        evaluate: Evaluate,
+        trials: int,
+        *,
+        executor: Executor | None = None,
+        progress: Callable[[Trial, Trial | None, int, int], None] | None = None,
+    ) -> Trial | None:
+        """Evaluate until the study has ``trials`` told trials, and return the best feasible one.
+
+        Trials that a dead process left running are evaluated first, again, with the same theta and seed: ``evaluate`` must be a
+        simulation. What it raises makes that trial failed and the study goes on. ``executor`` belongs to the caller, None evaluates
+        in this process. ``progress`` receives the trial told last, the best feasible trial, the number of done trials that broke a
+        limit and the number of failed trials.
+
+        On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt passes on; the same call resumes.
+        Raises ValueError for bad arguments, WorkerError when a worker process dies.
+        """
+        if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
+            raise ValueError(f"trials = {trials!r}, allowed is an integer >= 1")
+        check_crosses(evaluate, executor)
+        known = self.trials()
+        incumbent = best_feasible(known)
+        violating = sum(t.score is not None and not t.score.feasible for t in known)
+        failures = sum(t.status is TrialStatus.FAILED for t in known)
+        todo = [t for t in known if t.status is TrialStatus.RUNNING] or self.ask_batch(trials)
+        while todo:
+            with closing(outcomes(evaluate, todo, executor)) as finished:
+                for trial, outcome in finished:
+                    told = self.finish(trial.number, outcome.score, outcome.trace, outcome.ending)
+                    incumbent = best_feasible([t for t in (incumbent, told) if t is not None])
+                    violating += told.score is not None and not told.score.feasible
+                    failures += told.status is TrialStatus.FAILED
+                    if progress is not None:
+                        progress(told, incumbent, violating, failures)
+            todo = self.ask_batch(trials)
+        return incumbent
+
+    def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
+        thetas = np.asarray(self.tuner.ask(self.space, trials, n), dtype=float)
+        if thetas.shape != (n, self.space.dimension):
+            raise StudyError(f"the tuner proposed an array of shape {thetas.shape}, expected ({n}, {self.space.dimension})")
+        return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
+
+    def _record(self, first: int, thetas: Sequence[tuple[float, ...]]) -> list[Trial]:
+        now, made_with = utc_now(), self._provenance()
+        trials = [
+            Trial(number, theta, seed=trial_seed(self.seed, number), asked_at=now, provenance=made_with)
+            for number, theta in enumerate(thetas, start=first)
+        ]
+        self.store.add_trials(self.record.id, trials)
+        return trials
+
+    def _provenance(self) -> dict[str, Any]:
+        return {"study_sha256": self.record.identity_sha256, "versions": versions()}
+
+
+def _take_lease(store: Store, record: StudyRecord) -> Lease:
+    try:
+        lease = take_lease(store.path, record.id)
+    except OSError as error:
+        raise StoreError(f"{store.path}-lock: cannot be opened or locked ({error.strerror})") from error
+    if lease is None:
+        raise StudyError(f"{store.path}: study {record.name!r} is held by {store.holder(record.id)}; end that process, or wait for it")
+    return lease
