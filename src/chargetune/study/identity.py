@@ -37,8 +37,8 @@ def study_identity(name: str, *, config: Mapping[str, Any], space: ParameterSpac
     return plain
 
 
-def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_changed: bool) -> None:
-    """StudyError that lists what differs between the stored study and ``identity``, unless that is accepted.
+def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_changed: bool) -> bool:
+    """Whether ``identity`` differs from the stored one; StudyError that lists what differs unless that is accepted.
 
     Other names, sizes or units of the parameters are never accepted: the stored thetas would mean something else.
     """
@@ -48,9 +48,9 @@ def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_cha
             f"study {record.name!r} tunes other parameters: {', '.join(old)} -> {', '.join(new)};"
             " its trials do not fit, begin a study with another name"
         )
-    if accept_changed:
-        return
     lines = differences(dict(record.identity), dict(identity))
+    if accept_changed or not lines:
+        return bool(lines)
     shown = "".join(f"\n  {line}" for line in lines[:SHOWN]) + (f"\n  and {len(lines) - SHOWN} more" if len(lines) > SHOWN else "")
     raise StudyError(
         f"study {record.name!r} was begun with something else:{shown}\n"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 
 from chargetune.study.evaluation import Evaluate, Outcome, evaluate_trial
@@ -26,7 +26,7 @@ def check_crosses(evaluate: Evaluate, executor: Executor | None) -> None:
         raise ValueError(f"evaluate = {evaluate!r} does not go to another process ({error}); allowed is what pickle can copy") from error
 
 
-def outcomes(evaluate: Evaluate, trials: Sequence[Trial], executor: Executor | None) -> Iterator[tuple[Trial, Outcome]]:
+def outcomes(evaluate: Evaluate, trials: Sequence[Trial], executor: Executor | None) -> Generator[tuple[Trial, Outcome], None, None]:
     """Each trial with its outcome, in the order in which they finish; ``executor=None`` evaluates in this process.
 
     Closing the iterator cancels what did not begin. Raises WorkerError when the executor gives no result.

@@ -14,7 +14,9 @@ from sqlalchemy.pool import QueuePool
 from chargetune.study import schema
 from chargetune.study.provenance import utc_now, versions
 
-__all__ = ["StoreError", "connect_engine", "create_file", "explain"]
+__all__ = ["BEGIN_WRITING", "StoreError", "connect_engine", "create_file", "explain"]
+
+BEGIN_WRITING = "BEGIN IMMEDIATE"
 
 
 class StoreError(Exception):
@@ -55,9 +57,10 @@ def _create(path: Path) -> None:
     try:
         engine = connect_engine(aside, read_only=False, busy_timeout_s=0.0, mode="rwc")
         try:
-            with engine.connect() as connection:
+            # The one statement that must stand outside of a transaction. The mode stays with the file.
+            with engine.connect().execution_options(begin=None) as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode=WAL")
-            with engine.execution_options(immediate=True).begin() as connection:
+            with engine.execution_options(begin=BEGIN_WRITING).begin() as connection:
                 schema.metadata.create_all(connection)
                 made_by = f"chargetune {versions().get('chargetune', '(not installed)')}"
                 values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by}
@@ -75,7 +78,7 @@ def _create(path: Path) -> None:
 
 
 def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: str = "rw") -> Engine:
-    """An engine on the file; ``execution_options(immediate=True)`` takes the write lock at the beginning of a transaction."""
+    """An engine on the file; ``execution_options(begin=BEGIN_WRITING)`` takes the write lock at the beginning of a transaction."""
     query = "mode=ro" if read_only else f"mode={mode}"
     writable = os.access(path.parent, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
     if read_only and not writable and not path.with_name(path.name + "-wal").exists():
@@ -96,7 +99,9 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
 
     @event.listens_for(engine, "begin")
     def begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if connection.get_execution_options().get("immediate") else "BEGIN")
+        statement = connection.get_execution_options().get("begin", "BEGIN")
+        if statement is not None:
+            connection.exec_driver_sql(statement)
 
     return engine
 

@@ -19,7 +19,7 @@ from chargetune.episode.score import Score
 from chargetune.study import schema
 from chargetune.study.document import canonical_json, score_from_json, score_to_json, sha256
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.sqlite import StoreError, connect_engine, create_file, explain
+from chargetune.study.sqlite import BEGIN_WRITING, StoreError, connect_engine, create_file, explain
 from chargetune.study.trace import decode
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -222,7 +222,7 @@ class Store:
         if self.read_only:
             raise StoreError(f"{self.path}: opened read-only")
         try:
-            with self._engine.execution_options(immediate=True).begin() as connection:
+            with self._engine.execution_options(begin=BEGIN_WRITING).begin() as connection:
                 yield connection
         except IntegrityError as error:
             raise StoreError(f"{self.path}: refused by the store ({error.orig})") from error

@@ -81,8 +81,7 @@ class Study:
         lease = _take_lease(store, record)
         try:
             record = store.study(name)
-            if record.identity != identity:
-                check_change(record, identity, accept_changed=accept_changed)
+            if check_change(record, identity, accept_changed=accept_changed):
                 store.change_study(record.id, identity)
                 record = store.study(name)
             store.note_holder(record.id, os.getpid(), socket.gethostname())

@@ -1,0 +1,77 @@
+"""A deterministic study in two parameters: a tuner that learns, an evaluation that violates, fails and leaves a trace."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from chargetune.episode.score import Score
+from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.study.study import Study
+
+SPACE = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5), Parameter("r", 0.1, 6.0, 1.0, scale="log")))
+CONFIG = {"plant": {"noise": 1e-3, "steps": 20}, "name": "toy"}
+
+
+@dataclass(frozen=True)
+class Halfway:
+    """Half of the proposals fill the box by an additive recurrence, the others lie halfway to the best told trial."""
+
+    seed: int = 0
+
+    def ask(self, space, trials, n=1):
+        best = max((t for t in trials if t.score is not None), key=lambda t: (t.score.performance, -t.number), default=None)
+        shift = np.random.default_rng(self.seed).random(space.dimension)
+        points = []
+        for k in range(len(trials), len(trials) + n):
+            point = (shift + (k + 1) * np.array([0.7548776662466927, 0.5698402909980532])[: space.dimension]) % 1.0
+            if k % 2 and best is not None:
+                point = 0.5 * (point + space.to_unit(best.theta))
+            points.append(space.from_unit(point))
+        return np.array(points)
+
+
+@dataclass(frozen=True)
+class ToyEpisode:
+    voltage: np.ndarray
+
+    def arrays(self):
+        return {"time_s": np.arange(len(self.voltage)) * 10.0, "voltage": self.voltage}
+
+    def meta(self):
+        return {"units": {"voltage": "V"}, "sampling_time_s": 10.0}
+
+
+@dataclass(frozen=True)
+class Toy:
+    """``pause_s`` makes it last; a third of the box violates its limit, a corner raises."""
+
+    pause_s: float = 0.0
+
+    def __call__(self, theta, seed):
+        time.sleep(self.pause_s)
+        noise = np.random.default_rng(seed).normal(0, 1e-3, 20)
+        x, log_r = theta[0], np.log(theta[1])
+        if x > 0.85:
+            raise RuntimeError(f"the plant gave up at x = {x:.3f}")
+        objective = -((x - 0.3) ** 2) - 0.1 * log_r**2 + noise[0]
+        excess = x + 0.3 * log_r - 0.6
+        score = Score(objective, objective - max(0.0, excess) ** 2, {"v": excess}, {"v": 0.0}, {"t80_min": None, "x_end": x})
+        return score, ToyEpisode(4.0 + noise), "done"
+
+
+def crash(theta, seed):
+    """End the worker process without a word."""
+    import os
+
+    os._exit(7)
+
+
+def open_study(store, name="toy", **changes):
+    arguments = {"config": CONFIG, "space": SPACE, "tuner": Halfway(3), "seed": 11} | changes
+    return Study.create_or_resume(store, name, **arguments)
+
+
+def essence(trials):
+    """What must not depend on interruptions: all of a trial but times and provenance."""
+    return [(t.number, t.theta, t.status, t.score, t.ending, t.seed, t.trace_sha256) for t in trials]

@@ -1,0 +1,309 @@
+import os
+import shutil
+import sqlite3
+import tempfile
+import time
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from study_toy import CONFIG, SPACE, Halfway, Toy, essence, open_study
+
+from chargetune.episode.score import Score
+from chargetune.study.store import Store, StoreError
+from chargetune.study.trace import encode
+from chargetune.study.trial import Trial, TrialStatus
+
+SCORE = Score(-1.0, -1.5, {"v": 0.1}, {"v": 0.0}, {"t80_min": None})
+TRACE = encode({"v": np.arange(5.0)}, {"unit": "V"})
+
+
+def a_study(store, trials=2, name="a"):
+    record = store.add_study(name, {"config": CONFIG})
+    store.add_trials(record.id, [Trial(k, (0.1 * k, 1.0), seed=k, asked_at="t") for k in range(trials)])
+    return record.id
+
+
+def finish(store, study, number, score=SCORE, ending="done", trace=TRACE):
+    return store.finish_trial(study, number, score=score, ending=ending, trace=trace, provenance={"by": "test"})
+
+
+def raw(store, *statements):
+    with closing(sqlite3.connect(store.path, isolation_level=None)) as connection:
+        return [connection.execute(*s) if isinstance(s, tuple) else connection.execute(s) for s in statements][-1].fetchall()
+
+
+@contextmanager
+def unprivileged():
+    """Permission bits do not bind the superuser; as somebody else they do."""
+    user = os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+
+
+@pytest.fixture
+def public():
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    yield folder
+    folder.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+def test_what_is_told_is_read_back_after_reopening(store):
+    study = a_study(store)
+    finish(store, study, 0)
+    finish(store, study, 1, score=None, ending="RuntimeError: x", trace=None)
+    store.close()
+    with Store(store.path, read_only=True) as again:
+        assert [(r.name, r.trial_count, r.identity) for r in again.studies()] == [("a", 2, {"config": CONFIG})]
+        done, failed = again.trials(study)
+        assert (done.status, done.score, done.theta, done.ending, done.seed) == (TrialStatus.DONE, SCORE, (0.0, 1.0), "done", 0)
+        assert (failed.status, failed.score, failed.ending, failed.trace_sha256) == (TrialStatus.FAILED, None, "RuntimeError: x", None)
+        assert done.provenance == {"by": "test"}
+        arrays, meta = again.trace(study, 0)
+        np.testing.assert_array_equal(arrays["v"], np.arange(5.0))
+        assert meta == {"unit": "V"}
+        assert again.trace(study, 1) is None
+
+
+def test_studies_of_one_file_are_apart(store):
+    a, b = a_study(store, 2, "a"), a_study(store, 3, "b")
+    finish(store, b, 1)
+    assert [t.status for t in store.trials(a)] == ["running"] * 2
+    assert [t.status for t in store.trials(b)] == ["running", "done", "running"]
+    with pytest.raises(StoreError, match="a study 'a' already"):
+        a_study(store, 1, "a")
+    with pytest.raises(StoreError, match="no study 'c'; there are: a, b"):
+        store.study("c")
+
+
+def test_theta_and_score_keep_every_bit(store):
+    values = (0.1 + 0.2, 1e-308, -0.0, np.nextafter(1.0, 2.0))
+    study = store.add_study("a", {}).id
+    store.add_trials(study, [Trial(0, values)])
+    score = Score(values[0], values[3], {"v": values[1]}, {"v": values[2]})
+    finish(store, study, 0, score=score)
+    (trial,) = store.trials(study)
+    assert [v.hex() for v in trial.theta] == [float(v).hex() for v in values]
+    assert trial.score == score
+
+
+def test_tell_twice(store):
+    study = a_study(store)
+    first = finish(store, study, 0)
+    assert finish(store, study, 0) == first
+    for change in ({"score": None}, {"ending": "other"}, {"trace": None}, {"score": Score(-1.0, -1.5, {}, {})}):
+        with pytest.raises(StoreError, match="trial 0 is done already, with another result"):
+            finish(store, study, 0, **change)
+    assert store.trials(study)[0] == first
+    with pytest.raises(StoreError, match="no trial 7"):
+        finish(store, study, 7)
+
+
+@pytest.mark.parametrize("numbers", [[0], [3], [2, 2], [2, 4], [3, 2]])
+def test_numbers_go_on_without_gaps_or_nothing_is_stored(store, numbers):
+    study = a_study(store, 2)
+    with pytest.raises(StoreError, match="do not follow the 2 stored"):
+        store.add_trials(study, [Trial(k, (0.0,)) for k in numbers])
+    assert len(store.trials(study)) == 2
+
+
+@pytest.mark.parametrize("when", ["BEFORE INSERT ON trace", "AFTER INSERT ON trace", "BEFORE UPDATE ON trial", "AFTER UPDATE ON trial"])
+def test_trace_and_result_are_stored_both_or_neither(store, when):
+    study = a_study(store)
+    raw(store, f"CREATE TRIGGER fault {when} BEGIN SELECT RAISE(ABORT, 'injected fault'); END")
+    with pytest.raises(StoreError, match="injected fault"):
+        finish(store, study, 0)
+    assert raw(store, "SELECT count(*) FROM trace") == [(0,)]
+    assert store.trials(study)[0].status == "running"
+    raw(store, "DROP TRIGGER fault")
+    assert finish(store, study, 0).status == "done"
+    assert store.trace(study, 0) is not None
+
+
+def test_full_disk_loses_nothing_and_the_result_can_be_told_again(store, monkeypatch):
+    study = a_study(store)
+    finish(store, study, 0)
+    big = encode({"v": np.random.default_rng(0).random(200_000)}, {})
+    with store._engine.connect() as connection:
+        pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
+        connection.exec_driver_sql(f"PRAGMA max_page_count={pages + 10}")
+    with pytest.raises(StoreError, match="the disk is full"):
+        finish(store, study, 1, trace=big)
+    assert [t.status for t in store.trials(study)] == ["done", "running"]
+    with store._engine.connect() as connection:
+        connection.exec_driver_sql("PRAGMA max_page_count=1000000")
+    finish(store, study, 1, trace=big)
+    assert store.trace(study, 1)[0]["v"].size == 200_000
+
+
+def test_damaged_trace_is_that_trials_trouble_only(store):
+    study = a_study(store)
+    finish(store, study, 0)
+    finish(store, study, 1)
+    raw(store, ("UPDATE trace SET data = ? WHERE number = 0", (TRACE[:-1] + b"?",)))
+    with pytest.raises(StoreError, match="trace of trial 0 is damaged"):
+        store.trace(study, 0)
+    raw(store, "DELETE FROM trace WHERE number = 0")
+    with pytest.raises(StoreError, match="trace of trial 0 is damaged"):
+        store.trace(study, 0)
+    assert store.trace(study, 1) is not None
+    assert len(store.trials(study)) == 2
+
+
+def a_filled_file(path):
+    with Store(path) as store:
+        for name in "abcdefgh":
+            study = a_study(store, 60, name)
+            finish(store, study, 0)
+    return path
+
+
+def overwrite(path, start, data):
+    content = bytearray(path.read_bytes())
+    content[start : start + len(data)] = data
+    path.write_bytes(content)
+
+
+REFUSED = {
+    "folder": (lambda p: p.mkdir(), "a directory"),
+    "text": (lambda p: p.write_text("time,voltage\n" * 100), "not a store"),
+    "empty": (lambda p: p.touch(), "an empty file"),
+    "head": (lambda p: overwrite(a_filled_file(p), 0, b"x" * 16), "not a store"),
+    "cut": (lambda p: os.truncate(a_filled_file(p), p.stat().st_size // 2), "damaged"),
+    "garbage": (lambda p: overwrite(a_filled_file(p), 4096, os.urandom(p.stat().st_size - 4096)), "damaged"),
+    "zeros": (lambda p: overwrite(a_filled_file(p), 8192, bytes(p.stat().st_size - 8192)), "damaged"),
+    "other": (lambda p: raw_create(p, "CREATE TABLE t (x)"), "not a store of this program"),
+}
+
+
+def raw_create(path, statement):
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(statement)
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_is_no_store_is_refused_and_left_as_it_is(tmp_path, kind, read_only):
+    path = tmp_path / "s.db"
+    make, message = REFUSED[kind]
+    make(path)
+    before = None if path.is_dir() else path.read_bytes()
+    with pytest.raises(StoreError, match=message) as caught:
+        Store(path, read_only=read_only)
+    assert str(path) in str(caught.value)
+    assert before is None or path.read_bytes() == before
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_no_folder(tmp_path, read_only):
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path / "none" / "s.db", tmp_path / "file" / "s.db"):
+        with pytest.raises(StoreError, match="no such store" if read_only else "there is no folder"):
+            Store(path, read_only=read_only)
+    with pytest.raises(StoreError, match="too long"):
+        Store(tmp_path / ("x" * 300), read_only=read_only)
+
+
+def test_newer_schema_is_refused(store):
+    raw(store, "UPDATE chargetune_store SET schema_version = 99")
+    with pytest.raises(StoreError, match=r"schema version 99, this program knows versions up to 1"):
+        Store(store.path)
+
+
+def test_folder_without_write_permission(public):
+    with unprivileged(), pytest.raises(StoreError, match="permission"):
+        Store(public / "s.db")
+    path = public / "t.db"
+    with Store(path) as store:
+        finish(store, a_study(store), 0)
+    path.chmod(0o444)
+    public.chmod(0o555)
+    with unprivileged():
+        with pytest.raises(StoreError, match="permission"):
+            Store(path)
+        with Store(path, read_only=True) as store:
+            assert len(store.trials(1)) == 2
+    assert sorted(p.name for p in public.iterdir()) == ["t.db"]
+
+
+def test_read_only_reads_while_another_writes_and_changes_nothing(store):
+    study = a_study(store)
+    with Store(store.path, read_only=True) as reader:
+        finish(store, study, 0)
+        assert reader.trials(study)[0].status == "done"
+        for change in (lambda: finish(reader, study, 1), lambda: reader.add_study("b", {}), lambda: open_study(reader)):
+            with pytest.raises(StoreError, match="read-only"):
+                change()
+    assert [r.name for r in store.studies()] == ["a"]
+
+
+def test_long_lock_ends_in_a_message_that_names_the_holder(tmp_path):
+    with Store(tmp_path / "s.db", busy_timeout_s=0.2) as store, open_study(store) as study:
+        trial = study.ask()[0]
+        with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            start = time.monotonic()
+            with pytest.raises(StoreError, match=rf"locked by another process.*last holder: process {os.getpid()} on "):
+                study.tell(trial.number, SCORE)
+            assert 0.1 < time.monotonic() - start < 5
+            other.execute("ROLLBACK")
+        assert study.tell(trial.number, SCORE).status == "done"
+
+
+def test_commits_are_on_the_disk(store):
+    with store._engine.connect() as connection:
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+        assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
+
+
+def test_leftover_of_a_killed_creation_is_no_second_name_of_the_store(store):
+    leftover = store.path.with_name(f".other.db.{os.getpid()}.new")
+    leftover.hardlink_to(store.path)
+    a_study(store)
+    with Store(store.path.with_name("other.db")) as other:
+        assert other.studies() == []
+    assert [r.name for r in store.studies()] == ["a"]
+    assert not leftover.exists()
+
+
+def test_bad_timeout(tmp_path):
+    with pytest.raises(ValueError, match="busy_timeout_s = -1"):
+        Store(tmp_path / "s.db", busy_timeout_s=-1)
+
+
+def test_two_thousand_trials_list_fast(store):
+    record = store.add_study("a", {})
+    theta = tuple(np.random.default_rng(0).random(16))
+    store.add_trials(record.id, [Trial(k, theta, provenance={"versions": {"numpy": "2.0"}}) for k in range(2000)])
+    text = '{"excess":{"v":0.1},"metrics":{"t80_min":null},"objective":1.0,"performance":1.0,"tolerance":{"v":0.0}}'
+    blob = os.urandom(20_000)
+    with closing(sqlite3.connect(store.path)) as connection:
+        connection.execute("UPDATE trial SET status = 'done', score = ?", (text,))
+        connection.executemany("INSERT INTO trace VALUES (?, ?, ?)", [(record.id, k, blob) for k in range(2000)])
+        connection.commit()
+    start = time.process_time()
+    with Store(store.path, read_only=True) as reader:
+        trials = reader.trials(record.id)
+    assert len(trials) == 2000
+    assert trials[-1].score is not None
+    assert time.process_time() - start < 1.0  # 0.1 s here
+
+
+def test_a_study_of_the_toy_is_whole_in_the_file(store):
+    with open_study(store) as study:
+        study.run(Toy(), 6)
+        for trial in study.trials():
+            assert (study.trace(trial.number) is None) == (trial.status == "failed")
+        before = essence(study.trials())
+    with Store(store.path, read_only=True) as reader:
+        assert essence(reader.trials(reader.study("toy").id)) == before
+        assert reader.study("toy").identity["tuner"] == {"type": "Halfway", "seed": 3}
+    assert Halfway().ask(SPACE, []).shape == (1, 2)
