@@ -1,0 +1,39 @@
+"""The user owns the loop: ask for theta, charge by whatever means, tell what it was worth.
+
+Here the charge is simulated; on a test bench `charge` would run the cycler. Run: python examples/ask_tell.py [TRIALS]
+"""
+
+import sys
+
+from chargetune.battery.config import case_study
+from chargetune.learning import ConstrainedLogEI
+from chargetune.study.store import Store
+from chargetune.study.study import Study
+
+
+def main(trials, path):
+    """A study in a file: stop it at any time, run it again, and it goes on."""
+    config = case_study("backoff", mismatch_seed=1)
+    problem = config.problem()
+    tuner = ConstrainedLogEI(seed=0)
+    with Store(path) as store, Study.create_or_resume(store, "my cell", config=config.document(), space=problem.space, tuner=tuner) as study:
+        while True:
+            # A charge that was cut off last time comes first, then the tuner's next proposal.
+            waiting = study.running() or study.ask_batch(trials)
+            if not waiting:
+                break
+            for trial in waiting:
+                try:
+                    episode = problem.episode(trial.theta, trial.seed)
+                    score = problem.score(episode)
+                except (RuntimeError, ValueError) as error:
+                    study.fail(trial.number, str(error))
+                    continue
+                study.tell(trial.number, score, episode)
+                print(f"trial {trial.number}: overshoot {score.metrics['overshoot_mV']:6.1f} mV, t80 {score.metrics['t80_min'] or float('nan'):.1f} min")
+        best = study.best()
+    print("no trial kept the limits" if best is None else f"best: trial {best.number}, theta = {[round(v, 4) for v in best.theta]}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 15, sys.argv[2] if len(sys.argv) > 2 else "ask_tell.sqlite")

@@ -1,0 +1,140 @@
+"""The commands of ``chargetune``. Everything heavy is imported inside a command, so that ``--help`` is instant."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chargetune import __version__
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="chargetune",
+    help="Tune a model predictive charging controller in closed loop: fast, and within the limits.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class CaseName(StrEnum):
+    """The case studies."""
+
+    BACKOFF = "backoff"
+    MODEL = "model"
+    BOTH = "both"
+
+
+class TunerChoice(StrEnum):
+    """The tuners."""
+
+    DEFAULT = "default"
+    EI = "ei"
+    SOBOL = "sobol"
+
+
+ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program instead of text for a person.")]
+Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
+
+
+@app.command()
+def tune(
+    config: ConfigFile,
+    trials: Annotated[int | None, typer.Option(min=1, help="Trials in all; the file's number by default.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the study; the file's by default.")] = None,
+    store: Annotated[Path | None, typer.Option(help="Where trials are kept; by default OUT/study.sqlite or CONFIG's name.")] = None,
+    workers: Workers = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tune theta on the plant of a study file. The same command again resumes."""
+    from chargetune.cli.tune import tune_command  # noqa: PLC0415
+
+    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, as_json=as_json)
+
+
+@app.command()
+def simulate(
+    config: ConfigFile,
+    theta: Annotated[str | None, typer.Option(help='Values: "0.1,0.1,..." or JSON by name: \'{"backoff_V": [...]}\'. The file\'s by default.')] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbances.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Run one closed loop of a study file at one theta."""
+    from chargetune.cli.simulate import simulate_command  # noqa: PLC0415
+
+    simulate_command(config, theta=theta, seed=seed, as_json=as_json)
+
+
+@app.command()
+def show(
+    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    study: Annotated[str | None, typer.Option(help="Name of a study; by default all are listed.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the studies of a store, or the trials of one."""
+    from chargetune.cli.show import show_command  # noqa: PLC0415
+
+    show_command(store, study=study, as_json=as_json)
+
+
+@app.command()
+def reproduce(
+    case: Annotated[CaseName, typer.Argument(help="What theta is: the backoff, the model's R1, or both.", show_default=False)],
+    seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
+    trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
+    tuner: Annotated[TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, or Sobol points.")] = TunerChoice.DEFAULT,
+    workers: Workers = 2,
+    out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path("out/reproduce"),
+    as_json: AsJson = False,
+) -> None:
+    """Repeat a study of Hirt et al. (ADCHEM 2024) over mismatch seeds and decide its claims."""
+    from chargetune.cli.reproduce import reproduce_command  # noqa: PLC0415
+
+    reproduce_command(case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, as_json=as_json)
+
+
+def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
+    if value:
+        typer.echo(f"chargetune {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: FBT002
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; an error a person can mend is one message and exit code 2."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        typer.echo("interrupted; the same command resumes", err=True)
+        sys.exit(130)
+    except (ValueError, OSError) as error:
+        _refuse(error)
+    except Exception as error:
+        # Import only now: these modules are heavy, and are loaded already when one of them raised.
+        from chargetune.study.identity import StudyError  # noqa: PLC0415
+        from chargetune.study.runner import WorkerError  # noqa: PLC0415
+        from chargetune.study.sqlite import StoreError  # noqa: PLC0415
+
+        if not isinstance(error, (StudyError, StoreError, WorkerError)):
+            raise
+        _refuse(error)
+
+
+def _refuse(error: BaseException) -> None:
+    text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+    typer.echo(f"chargetune: {text}", err=True)
+    sys.exit(2)

@@ -1,0 +1,75 @@
+"""How results look on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.episode.score import Score
+from chargetune.study.trial import Trial
+
+__all__ = ["console", "metrics_table", "theta_lines", "trials_table"]
+
+ROWS = (
+    ("overshoot_mV", "worst voltage over the limit", "mV"),
+    ("overshoot_mVs", "its integral", "mV s"),
+    ("t80_min", "time to 80 % SOC", "min"),
+    ("t90_min", "time to 90 % SOC", "min"),
+    ("t95_min", "time to 95 % SOC", "min"),
+    ("t99_min", "time to 99 % SOC", "min"),
+    ("switch_min", "end of constant current", "min"),
+    ("soc_end", "SOC at the end", ""),
+    ("solver_failures", "control steps not solved to tolerance", ""),
+)
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Where text for a person goes."""
+    return Console(stderr=stderr, highlight=False)
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A figure, or a dash where the episode never got there."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) -> Table:
+    """One column a run, one row a figure."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for name in scores:
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for key, label, unit in ROWS:
+        table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
+    verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
+    table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
+    return table
+
+
+def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:
+    """theta, one parameter a line."""
+    return "\n".join(f"  {name} = {value:.5g} {'' if unit == '1' else unit}".rstrip() for name, unit, value in zip(names, units, theta, strict=True))
+
+
+def trials_table(trials: Sequence[Trial]) -> Table:
+    """One row a trial."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("trial", "status", "overshoot mV", "t80 min", "t95 min", "G", "limits", "ending"):
+        table.add_column(heading, justify="left" if heading in ("status", "limits", "ending") else "right")
+    for t in trials:
+        s = t.score
+        table.add_row(
+            str(t.number),
+            t.status.value,
+            number(s.metrics.get("overshoot_mV")) if s else "-",
+            number(s.metrics.get("t80_min")) if s else "-",
+            number(s.metrics.get("t95_min")) if s else "-",
+            f"{s.performance:.4g}" if s else "-",
+            ("kept" if s.feasible else "[red]broken[/]") if s else "-",
+            t.ending or "",
+        )
+    return table

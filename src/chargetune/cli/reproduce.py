@@ -1,0 +1,86 @@
+"""chargetune reproduce."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, cast
+
+from rich.table import Table
+
+from chargetune.battery.config import case_study
+from chargetune.battery.reproduce import TunerName, reproduce, summarise
+from chargetune.cli.output import console, number
+from chargetune.cli.tune import bar
+from chargetune.study.executors import process_executor
+
+__all__ = ["reproduce_command", "seed_list"]
+
+
+def seed_list(text: str) -> list[int]:
+    """"A:B" as range(A, B), or "A,B,C". Raises ValueError."""
+    try:
+        if ":" in text:
+            first, last = (int(part) for part in text.split(":"))
+            seeds = list(range(first, last))
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"--seeds = {text!r}: expected A:B or A,B,C") from error
+    if not seeds or min(seeds) < 0 or len(set(seeds)) != len(seeds):
+        raise ValueError(f"--seeds = {text!r}: allowed are different whole numbers >= 0, at least one")
+    return seeds
+
+
+def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers: int, out: Path, as_json: bool) -> None:
+    """Run the study for every seed, decide the claims, draw the figures."""
+    from chargetune.report import save_figures, seeds_figure  # noqa: PLC0415
+
+    numbers, name = seed_list(seeds), cast("TunerName", tuner)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{case}-{tuner}.sqlite"
+    with process_executor(min(workers, len(numbers))) as executor, bar(quiet=as_json) as progress:
+        task = progress.add_task(f"{case}, {tuner}", total=len(numbers), note="")
+        safe = 0
+
+        def note(seed: int, row: dict[str, Any]) -> None:
+            nonlocal safe
+            tuned = row["tuned"]
+            safe += bool(tuned and tuned["overshoot_mV"] <= 1.0)
+            progress.update(task, advance=1, note=f"seed {seed}: t95 {number(tuned['t95_min'] if tuned else None)} min; {safe} seeds safe")
+
+        rows = reproduce(case, numbers, trials=trials, tuner=name, path=path, executor=executor, progress=note)
+    result = summarise(out, case, name, rows, trials)
+    for target in (out / "claims.json", out / f"claims-{case}-{tuner}.json"):
+        target.write_text(json.dumps(result, indent=1))
+    figures = save_figures(path, case_study(case, numbers[0], name).study.name, out / f"{case}-{tuner}-seed{numbers[0]}")
+    seeds_figure(rows, out / f"{case}-{tuner}-seeds.png")
+    if as_json:
+        print(json.dumps(result))  # noqa: T201
+        return
+    screen = console()
+    screen.print(_rows_table(rows))
+    summary = result["summary"]
+    screen.print(f"\n{summary['safe']} of {summary['of']} seeds within 1 mV, median t95 {number(summary['t95_min_median'])} min, "
+                 f"{summary['violating_trials']} of {summary['all_trials']} trials violated")  # fmt: skip
+    table = Table(box=None, pad_edge=False, title="Claims", title_justify="left")
+    for heading in ("", "claim", "holds"):
+        table.add_column(heading)
+    for claim in result["claims"]:
+        table.add_row(str(claim["id"]), claim["text"], f"{claim['holds']} of {claim['of']}" if claim["of"] else "needs the other study in the same --out")
+    screen.print(table)
+    screen.print(f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")))
+
+
+def _rows_table(rows: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("seed", "untuned mV", "t95", "tuned mV", "t80", "t95", "attainable t95", "violating", "worst mV"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        untuned, tuned = row["untuned"], row["tuned"] or {}
+        table.add_row(
+            str(row["seed"]), number(untuned["overshoot_mV"], 1), number(untuned["t95_min"]), number(tuned.get("overshoot_mV"), 2),
+            number(tuned.get("t80_min")), number(tuned.get("t95_min")), number(row["attainable_t95_min"], 1),
+            f"{row['violating_trials']}/{row['trials']}", number(row["worst_excess_mV"], 1),
+        )  # fmt: skip
+    return table

@@ -1,0 +1,66 @@
+"""chargetune simulate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.config import load_config
+from chargetune.cli.output import console, metrics_table
+
+__all__ = ["simulate_command"]
+
+
+def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool) -> None:
+    """Run one closed loop and print what it was worth; with ``as_json`` also the trajectory."""
+    config = load_config(path)
+    problem = config.problem(path.parent)
+    values = config.values(problem) if theta is None else _parse(theta, problem)
+    episode = problem.episode(values, seed)
+    if not len(episode):
+        raise ValueError(f"the episode has no interval; it ended with {episode.ending.value}: {episode.message}")
+    score = problem.score(episode)
+    start, end = episode.signal("voltage_V")
+    _, soc = episode.signal("soc")
+    if as_json:
+        data: dict[str, Any] = {
+            "overshoot_mV": score.metrics["overshoot_mV"],
+            "t80_min": score.metrics["t80_min"],
+            "t95_min": score.metrics["t95_min"],
+            "soc": [problem.soc_start, *soc.tolist()],
+            "current_A": episode.input[:, 0].tolist(),
+            "voltage_start_V": start.tolist(),
+            "voltage_end_V": end.tolist(),
+            "status": episode.status.tolist(),
+            "kkt_worst": float(np.max(episode.kkt)),
+            "theta": dict(zip(problem.space.entries, values.tolist(), strict=True)),
+            "ending": episode.ending.value,
+            "score": {"objective": score.objective, "performance": score.performance, "excess": dict(score.excess), "feasible": score.feasible},
+            "metrics": dict(score.metrics),
+        }
+        print(json.dumps(data))  # noqa: T201
+        return
+    out = console()
+    out.print(f"[bold]{problem.plant_cell.name}[/], {len(episode)} intervals of {problem.sampling_time_s:g} s, ended: {episode.ending.value}")
+    if problem.plant_cell.remark:
+        out.print(f"[dim]{problem.plant_cell.remark}[/]")
+    out.print(metrics_table({"this run": score}, problem))
+
+
+def _parse(text: str, problem: ChargingProblem) -> NDArray[np.float64]:
+    if text.lstrip().startswith("{"):
+        try:
+            named = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"--theta is not valid JSON: {error}") from error
+        return problem.space.from_dict(named)
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"--theta = {text!r}: expected numbers separated by commas, or a JSON object of named values") from error
+    return problem.space.validate(numbers)

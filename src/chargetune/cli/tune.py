@@ -1,0 +1,105 @@
+"""chargetune tune."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from chargetune.battery.config import Config, load_config
+from chargetune.battery.reproduce import open_study, tuned_trial
+from chargetune.cli.output import console, metrics_table, number, theta_lines
+from chargetune.study.executors import process_executor
+from chargetune.study.store import Store
+from chargetune.study.trial import Trial, TrialStatus
+
+__all__ = ["bar", "tune_command"]
+
+
+def bar(*, quiet: bool) -> Progress:
+    """A progress bar on stderr, so that a program can read stdout."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    return Progress(*columns, console=console(stderr=True), disable=quiet)
+
+
+def tune_command(
+    path: Path, *, trials: int | None, seed: int | None, store: Path | None, workers: int, out: Path | None, as_json: bool
+) -> None:
+    """Tune, show the way there, and say what came of it."""
+    config = load_config(path)
+    if seed is not None:
+        config = config.model_copy(update={"study": config.study.model_copy(update={"seed": seed})})
+    count = config.study.trials if trials is None else trials
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    kept = store or (out / "study.sqlite" if out else Path(f"{path.stem}.sqlite"))
+    problem = config.problem(path.parent)
+    if not problem.space.dimension:
+        raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
+
+    with ExitStack() as stack:
+        opened = stack.enter_context(Store(kept))
+        study = stack.enter_context(open_study(opened, config, path.parent))
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
+        known = study.trials()
+        done = sum(t.status is not TrialStatus.RUNNING for t in known)
+        progress = stack.enter_context(bar(quiet=as_json))
+        task = progress.add_task("tuning", total=count, completed=min(done, count), note=f"resumed at trial {done}" if done else "")
+
+        def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
+            best = "none within the limits yet"
+            if incumbent is not None and incumbent.score is not None:
+                best = f"best t95 {number(incumbent.score.metrics.get('t95_min'))} min (trial {incumbent.number})"
+            progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
+
+        study.run(problem, count, executor=executor, progress=note)
+        everything = study.trials()[:count]
+
+    best = tuned_trial(everything, config.study.tuner)
+    figures: list[Path] = []
+    if out is not None:
+        from chargetune.report import save_figures  # noqa: PLC0415
+
+        figures = save_figures(kept, config.study.name, out)
+    summary = _summary(config, everything, best, problem.space.entries)
+    if out is not None:
+        (out / "summary.json").write_text(json.dumps(summary, indent=1))
+    if as_json:
+        print(json.dumps(summary))  # noqa: T201
+        return
+    screen = console()
+    violating = sum(t.score is not None and not t.score.feasible for t in everything)
+    failed = sum(t.status is TrialStatus.FAILED for t in everything)
+    screen.print(f"\n[bold]{problem.plant_cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    if problem.plant_cell.remark:
+        screen.print(f"[dim]{problem.plant_cell.remark}[/]")
+    untuned = everything[0].score if everything else None
+    screen.print(metrics_table({"untuned": untuned, "tuned": best.score if best else None}, problem))
+    if best is None:
+        screen.print("[red]No trial kept the limits.[/] More trials, a wider theta, or a more cautious start may help.")
+    else:
+        units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
+        screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
+    screen.print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+
+
+def _summary(config: Config, trials: list[Trial], best: Trial | None, names: tuple[str, ...]) -> dict[str, Any]:
+    def facts(trial: Trial | None) -> dict[str, Any] | None:
+        if trial is None or trial.score is None:
+            return None
+        s = trial.score
+        return {"trial": trial.number, "feasible": s.feasible, "objective": s.objective, "excess": dict(s.excess), "metrics": dict(s.metrics)}
+
+    return {
+        "study": config.study.name,
+        "tuner": config.study.tuner,
+        "trials": len(trials),
+        "violating": sum(t.score is not None and not t.score.feasible for t in trials),
+        "failed": sum(t.status is TrialStatus.FAILED for t in trials),
+        "untuned": facts(trials[0]) if trials else None,
+        "tuned": facts(best),
+        "theta": dict(zip(names, best.theta, strict=True)) if best else None,
+    }

@@ -1,0 +1,310 @@
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from study_toy import CONFIG, SPACE, Halfway, Toy, ToyEpisode, essence, open_study
+
+from chargetune.episode.score import Score
+from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.study.evaluation import trial_seed
+from chargetune.study.store import Store, StoreError
+from chargetune.study.study import StudyError
+from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
+
+GOOD = Score(1.0, 1.0, {"v": -0.1}, {"v": 0.0})
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Proposes what it was given."""
+
+    thetas: tuple
+
+    def ask(self, space, trials, n=1):
+        return np.array(self.thetas)
+
+
+def uninterrupted(tmp_path, trials=24, **changes):
+    with Store(tmp_path / "whole.db") as store, open_study(store, **changes) as study:
+        study.run(Toy(), trials)
+        return essence(study.trials())
+
+
+def test_the_toy_is_worth_testing_with(tmp_path):
+    found = uninterrupted(tmp_path)
+    assert [e[0] for e in found] == list(range(24))
+    assert {e[2] for e in found} == {"done", "failed"}
+    assert {e[3].feasible for e in found if e[3]} == {True, False}
+    assert any(e[4].startswith("RuntimeError: the plant gave up at x = 0.") for e in found if e[2] == "failed")
+    assert len({e[5] for e in found}) == 24
+
+
+def test_same_seed_same_trials_other_seed_other_trials(store, tmp_path):
+    with open_study(store) as study:
+        study.run(Toy(), 24)
+        assert essence(study.trials()) == uninterrupted(tmp_path)
+    for name, change in {"b": {"seed": 12}, "c": {"tuner": Halfway(4)}}.items():
+        with open_study(store, name, **change) as study:
+            study.run(Toy(), 24)
+            assert essence(study.trials()) != uninterrupted(tmp_path)
+
+
+@pytest.mark.parametrize("batch", [1, 3, 4])
+def test_ask_and_tell_by_hand_is_run(store, tmp_path, batch):
+    with open_study(store, batch=batch) as study:
+        while len(study.trials()) < 24:
+            for trial in reversed(study.ask(batch)):
+                assert study.running()
+                try:
+                    score, episode, ending = Toy()(np.array(trial.theta), trial.seed)
+                except RuntimeError as error:
+                    study.fail(trial.number, f"RuntimeError: {error}")
+                else:
+                    study.tell(trial.number, score, episode, ending=ending)
+        assert not study.running()
+        assert essence(study.trials()) == uninterrupted(tmp_path, batch=batch)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+@pytest.mark.parametrize("batch", [1, 4])
+def test_workers_and_order_of_finishing_do_not_matter(store, tmp_path, batch, workers):
+    def late_first(theta, seed):
+        threading.Event().wait(0.004 * (seed % 4))
+        return Toy()(theta, seed)
+
+    with open_study(store, batch=batch) as study, ThreadPoolExecutor(workers) as pool:
+        study.run(late_first, 12, executor=pool)
+        assert essence(study.trials()) == uninterrupted(tmp_path, 12, batch=batch)
+
+
+def test_stopping_within_a_batch_and_going_on_is_one_study(store, tmp_path):
+    for trials in (1, 6, 7, 7, 13, 24):
+        with open_study(store, batch=4) as study:
+            study.run(Toy(), trials)
+            assert len(study.trials()) == trials
+    assert essence(store.trials(1)) == uninterrupted(tmp_path, batch=4)
+
+
+@pytest.mark.parametrize("batch", [1, 4])
+@pytest.mark.parametrize("workers", [None, 2])
+def test_ctrl_c_stops_and_the_same_call_resumes(store, tmp_path, batch, workers):
+    calls = []
+
+    def interrupted(theta, seed):
+        calls.append(seed)
+        if len(calls) in {3, 9, 10}:
+            raise KeyboardInterrupt
+        return Toy()(theta, seed)
+
+    stops = 0
+    with ThreadPoolExecutor(workers or 1) as pool:
+        for _ in range(4):
+            with open_study(store, batch=batch) as study:
+                try:
+                    study.run(interrupted, 24, executor=pool if workers else None)
+                except KeyboardInterrupt:
+                    stops += 1
+                    assert len(study.trials()) < 24
+                    assert 1 <= len(study.running()) <= batch
+    assert 2 <= stops <= 3
+    assert essence(store.trials(1)) == uninterrupted(tmp_path, batch=batch)
+
+
+def test_progress_sees_incumbent_violations_and_failures(store):
+    seen = []
+    with open_study(store) as study:
+        study.run(Toy(), 9)
+        best = study.run(Toy(), 24, progress=lambda *args: seen.append(args))
+        trials = study.trials()
+        assert best == study.best() == seen[-1][1]
+    assert [args[0] for args in seen] == trials[9:]
+    for trial, incumbent, violating, failures in seen:
+        so_far = trials[: trial.number + 1]
+        assert incumbent == best_feasible(so_far)
+        assert violating == sum(t.status == "done" and not t.feasible for t in so_far)
+        assert failures == sum(t.status == "failed" for t in so_far)
+    assert seen[-1][2] > 0
+    assert seen[-1][3] > 0
+
+
+def test_best_takes_the_feasible_one_and_the_earlier_of_equals():
+    def done(number, objective, performance, excess):
+        return Trial(number, (), TrialStatus.DONE, Score(objective, performance, {"v": excess}, {"v": 0.01}))
+
+    trials = [Trial(0, ()), Trial(1, (), TrialStatus.FAILED), done(2, 1, 5, 0.01), done(3, 1, 6, 0), done(4, 9, 6, 0.02)]
+    assert best_feasible(trials).number == 2
+    assert best_performance(trials).number == 3
+    assert best_feasible(reversed(trials)).number == 2
+    assert best_feasible([trials[4]]) is None
+    assert best_performance(trials[:2]) is None
+
+
+@pytest.mark.parametrize(
+    ("result", "reason"),
+    [
+        ((Score(float("nan"), 0.0, {}, {}), None, "done"), r"ValueError: score\.objective = nan"),
+        ((Score(0.0, 0.0, {"v": float("inf")}, {}), None, "done"), r"ValueError: score\.excess\[v\] = inf"),
+        ((None, ToyEpisode(np.ones(3)), "sensor: voltage is nan"), "sensor: voltage is nan"),
+        ((GOOD, None, None), "ValueError: ending = None"),
+        ((GOOD, None), "ValueError: not enough values"),
+        ((GOOD, "text", "done"), "AttributeError: "),
+        ((1.0, None, "done"), "ValueError: score = 1.0"),
+        (None, "TypeError: "),
+    ],
+)
+def test_what_evaluate_gives_wrong_is_a_failed_trial_without_numbers(store, result, reason):
+    with open_study(store) as study:
+        assert study.run(lambda theta, seed: result, 2) is None
+        trials = study.trials()
+    assert [t.status for t in trials] == ["failed"] * 2
+    assert all(t.score is None and t.ending.startswith(reason.replace("\\", "")) for t in trials)
+    has_trace = isinstance(result, tuple) and isinstance(result[1], ToyEpisode)
+    assert [t.trace_sha256 is not None for t in trials] == [has_trace] * 2
+
+
+def test_tell_and_fail_are_idempotent_and_refuse_nonsense(store):
+    with open_study(store) as study:
+        a, b = study.ask(2)
+        episode = ToyEpisode(np.array([4.0, np.nan]))
+        told = study.tell(a.number, GOOD, episode)
+        assert study.tell(a.number, GOOD, ToyEpisode(episode.voltage.copy())) == told
+        with pytest.raises(StoreError, match="another result"):
+            study.fail(a.number, "no")
+        for objective in (None, float("nan"), float("inf"), "1"):
+            with pytest.raises(ValueError, match=r"score\.objective = .* a finite number"):
+                study.tell(b.number, replace(GOOD, objective=objective))
+        with pytest.raises(ValueError, match="ending = ''"):
+            study.fail(b.number, "")
+        with pytest.raises(StoreError, match="no trial 2"):
+            study.tell(2, GOOD)
+        assert study.running() == [b]
+        assert study.fail(b.number, "gone") == study.fail(b.number, "gone")
+        np.testing.assert_array_equal(study.trace(a.number)[0]["voltage"], episode.voltage)
+        assert study.best() == study.best_performance() == told
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"config": {"plant": {"noise": 2e-3, "steps": 20}, "name": "toy"}}, r"config\.plant\.noise: 0\.001 -> 0\.002"),
+        ({"config": {"plant": {"noise": 1e-3}, "name": "toy"}}, r"config\.plant\.steps: 20 -> \(absent\)"),
+        ({"tuner": Halfway(4)}, r"tuner\.seed: 3 -> 4"),
+        ({"seed": 12}, r"seed: 11 -> 12"),
+        ({"batch": 2}, r"batch: 1 -> 2"),
+        ({"space": ParameterSpace((replace(SPACE.parameters[0], upper=0.9), SPACE.parameters[1]))}, r"space\[0\]\.upper: 1\.0 -> 0\.9"),
+    ],
+)
+def test_resume_with_something_changed(store, change, line):
+    with open_study(store) as study:
+        study.run(Toy(), 3)
+        before = essence(study.trials())
+    with pytest.raises(StudyError, match=line):
+        open_study(store, **change)
+    with open_study(store) as study:
+        assert essence(study.trials()) == before
+    with open_study(store, **change, accept_changed=True) as study:
+        study.run(Toy(), 4)
+        trials = study.trials()
+    assert essence(trials)[:3] == before
+    assert trials[3].provenance["study_sha256"] != trials[2].provenance["study_sha256"]
+    with open_study(store, **change) as study:
+        assert len(study.trials()) == 4
+
+
+def test_other_parameters_are_never_accepted(store):
+    open_study(store).close()
+    for parameters in ((SPACE.parameters[1], SPACE.parameters[0]), (SPACE.parameters[0],), (replace(SPACE.parameters[0], unit="V"),)):
+        with pytest.raises(StudyError, match="tunes other parameters"):
+            open_study(store, space=ParameterSpace(parameters), accept_changed=True)
+
+
+def test_what_is_not_in_the_identity_may_change(store):
+    open_study(store, config={"steps": 1, "nodes": (1, 2)}).close()
+    open_study(store, config={"nodes": [1.0, np.float64(2)], "steps": 1}).close()
+
+
+@pytest.mark.parametrize("name", ["", " a", "a ", "../a", "a/b", "a\\b", "<b>a</b>", "a\nb", "_a", "-a", "a" * 101, 'a"b', "a&b", "a\0"])
+def test_bad_names(store, name):
+    with pytest.raises(ValueError, match="study name = "):
+        open_study(store, name)
+    assert store.studies() == []
+
+
+@pytest.mark.parametrize("name", ["a", "both, seed 3", "2026-01-02 R1 (model)", "Zelle Größe @25", "a" * 100])
+def test_good_names(store, name):
+    with open_study(store, name):
+        assert store.study(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, "seed = -1, allowed is an integer >= 0"),
+        ({"seed": True}, "seed = True"),
+        ({"batch": 0}, "batch = 0, allowed is an integer >= 1"),
+        ({"batch": 1.5}, "batch = 1.5"),
+        ({"space": ParameterSpace(())}, "no parameters"),
+        ({"config": {"a": {"b": float("nan")}}}, r"study\.config\.a\.b = nan"),
+        ({"config": {"a": object()}}, r"study\.config\.a is a object"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_stored(store, change, message):
+    with pytest.raises(ValueError, match=message):
+        open_study(store, **change)
+    assert store.studies() == []
+
+
+@pytest.mark.parametrize("n", [0, -1, True, 1.0])
+def test_bad_counts(store, n):
+    with open_study(store) as study:
+        with pytest.raises(ValueError, match=f"n = {n}"):
+            study.ask(n)
+        with pytest.raises(ValueError, match=f"trials = {n}"):
+            study.run(Toy(), n)
+
+
+@pytest.mark.parametrize(
+    ("thetas", "error"),
+    [
+        (((0.5, 7.0),), r"theta: r = 7, allowed is \[0.1, 6\]"),
+        (((0.5, np.nan),), "theta: r = nan"),
+        (((0.5,),), r"shape \(1, 1\), expected \(1, 2\)"),
+        (((0.5, 1.0), (0.5, 1.0)), r"shape \(2, 2\), expected \(1, 2\)"),
+    ],
+)
+def test_bad_proposals_never_become_trials(store, thetas, error):
+    with open_study(store, tuner=Fixed(thetas)) as study:
+        with pytest.raises((ValueError, StudyError), match=error):
+            study.run(Toy(), 1)
+        assert study.trials() == []
+
+
+def test_seeds_are_independent_and_fit_into_json():
+    seeds = [trial_seed(study, number) for study in range(30) for number in range(100)]
+    assert len(set(seeds)) == 3000
+    assert all(0 <= s < 2**53 for s in seeds)
+    assert abs(np.mean(seeds) / 2**53 - 0.5) < 0.03
+    assert trial_seed(0, 0) == 7742787082098466  # pinned: a new version must repeat old studies
+
+
+def test_ask_with_pending_trials(store):
+    with open_study(store, batch=2) as study:
+        first = study.ask(3)
+        assert [t.number for t in first] == [0, 1, 2]
+        assert study.running() == study.trials() == first
+        with pytest.raises(StudyError, match=r"the trials \[0, 1\] are not told"):
+            study.ask_batch(10)
+        study.tell(0, GOOD)
+        assert [t.number for t in study.ask()] == [3]
+
+
+def test_config_of_the_toy_is_stored(store):
+    with open_study(store) as study:
+        study.run(Toy(), 1)
+        (trial,) = study.trials()
+        assert study.record.identity["config"] == CONFIG
+        assert trial.provenance["study_sha256"] == study.record.identity_sha256
+        assert trial.provenance["versions"]["numpy"] == np.__version__
+        assert Parameter(**{**study.record.identity["space"][1], "default": (1.0,)}) == SPACE.parameters[1]
