@@ -10,6 +10,8 @@ from chargetune.model.splines import natural_spline, pchip
 
 __all__ = ["ecm_model", "table_nodes"]
 
+FLOOR = 1e-3
+
 
 def table_nodes(soc: tuple[float, ...]) -> list[float]:
     """Spline nodes of a table over SOC: the table's own, and 0 and 1 where it does not reach them."""
@@ -25,7 +27,8 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0) -> Model:
 
     exact for a current held over the interval and R1, C1 held at their value at its start. R0, R1, C1 are natural
     cubic splines over SOC whose node values are run-time parameters, held constant beyond the first and last node of
-    the table up to SOC 0 and 1; OCV is monotone PCHIP. Source: case study of Hirt et al., ADCHEM 2024, with the sign
+    the table up to SOC 0 and 1, and kept positive by (s + sqrt(s^2 + r^2)) / 2 with r a thousandth of their mean (a
+    change below 1e-6 of the value at the nodes); OCV is monotone PCHIP. Source: case study of Hirt et al., ADCHEM 2024, with the sign
     of V corrected (OCV - U1 - R0 I, as printed there, never reaches 4.2 V when charging).
     """
     nodes = table_nodes(cell.soc)
@@ -33,7 +36,10 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0) -> Model:
 
     def table(z: ca.SX, values: ca.SX) -> ca.SX:
         ends = [values[0]] * low, [values[-1]] * high
-        return natural_spline(z, nodes, ca.vertcat(*ends[0], values, *ends[1]))
+        spline = natural_spline(z, nodes, ca.vertcat(*ends[0], values, *ends[1]))
+        # Between very unequal nodes a cubic spline dips below zero, where the circuit would be unstable.
+        rounding = FLOOR * ca.sum1(values) / values.shape[0]
+        return (spline + ca.sqrt(spline**2 + rounding**2)) / 2
 
     def equations(x: Named, u: Named, p: Named) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         z, u1, current = x["soc"], x["overpotential_V"], u["current_A"]

@@ -7,7 +7,7 @@
  * lower one, zero is inactive. Matrices are column-major on the way in (H is symmetric).
  * Rows are generated: the QP is solved with those that the guess says are active, and again with those that its solution
  * breaks, until it breaks none. Setting up a row costs as much as a pivot and most rows of a long horizon never matter.
- * QP_N variables and QP_M rows are set by the compiler's command line, QP_NAME is the name of the function.
+ * QP_N variables, QP_M rows and QP_TOLERANCE are set by the compiler's command line, QP_NAME is the name of the function.
  * DAQP: Arnstrom, Bemporad, Axehill, IEEE Trans. Automatic Control 67 (2022), doi 10.1109/TAC.2022.3176430.
  */
 #include <daqp/api.h>
@@ -56,6 +56,7 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
 
   memset(&work, 0, sizeof work);
   daqp_default_settings(&settings);
+  settings.primal_tol = QP_TOLERANCE;
   result.x = primal;
   result.lam = dual;
   qp.n = work.n = VARS;

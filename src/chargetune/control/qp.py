@@ -21,6 +21,9 @@ from chargetune.control.compiler import compile_library
 
 __all__ = ["QPSolver", "daqp", "daqp_warm", "warm_sources"]
 
+# DAQP's default of 1e-6 is noise of 1e-7 in the merit function, enough to refuse good steps near the solution.
+PRIMAL_TOLERANCE = 1e-9
+
 QPSolver = Callable[[int, int], ca.Function]
 
 
@@ -29,7 +32,7 @@ def daqp(variables: int, rows: int) -> ca.Function:
     h, g, a = ca.MX.sym("H", variables, variables), ca.MX.sym("g", variables), ca.MX.sym("A", rows, variables)
     uba, lbx, ubx = ca.MX.sym("uba", rows), ca.MX.sym("lbx", variables), ca.MX.sym("ubx", variables)
     guess = ca.MX.sym("guess", variables + rows)
-    qp = ca.conic("qp", "daqp", {"h": h.sparsity(), "a": a.sparsity()}, {"error_on_fail": False})
+    qp = ca.conic("qp", "daqp", {"h": h.sparsity(), "a": a.sparsity()}, {"error_on_fail": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}})
     solution = qp(h=h, g=g, a=a, lba=-np.inf, uba=uba, lbx=lbx, ubx=ubx)
     return ca.Function("daqp", [h, g, a, uba, lbx, ubx, guess], [solution["x"], ca.vertcat(solution["lam_x"], solution["lam_a"])])
 
@@ -44,7 +47,7 @@ def daqp_warm(variables: int, rows: int) -> ca.Function:
 def warm_sources(variables: int, rows: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """(C sources, macro definitions) of `daqp_warm`, to compile it together with a function that calls it."""
     source = files(__package__).joinpath("daqp_warm.c").read_text()
-    return (source,), (f"QP_NAME={_warm_name(variables, rows)}", f"QP_N={variables}", f"QP_M={rows}")
+    return (source,), (f"QP_NAME={_warm_name(variables, rows)}", f"QP_N={variables}", f"QP_M={rows}", f"QP_TOLERANCE={PRIMAL_TOLERANCE!r}")
 
 
 def _warm_name(variables: int, rows: int) -> str:

@@ -27,6 +27,8 @@ __all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
 # Of the scaled problem, where 1 is the whole range of an input or one `scale` of a limit: 1e-4 of 6 A is 0.6 mA.
 KKT_TOLERANCE = 1e-4
 HALVINGS_MAX = 6
+# Violations of this share of a limit's scale come from the QP solver's own tolerance.
+MERIT_ROUNDING = 1e-9
 
 
 class SolveStatus(IntEnum):
@@ -99,14 +101,16 @@ def _shift(problem: Problem) -> list[int]:
 
 def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     """One SQP iteration: (now, U, c, D, merit, dual, lower, upper, q) -> (U, c, D, merit, dual, kkt) at the next U."""
+    limits = problem.controller.limits
     nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
     now, inputs, c, derivatives = (ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2))))
     merit, dual, q = ca.MX.sym("merit"), ca.MX.sym("dual", _duals(problem)), ca.MX.sym("q", nq)
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
     *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper)
     solution, new_dual = qp(problem.variables, rows)(*data, dual)
-    # What phi may rise by is below the solver's tolerance in the scaled cost.
-    allowed = merit + KKT_TOLERANCE**2 / gamma
+    # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
+    rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
+    allowed = merit + KKT_TOLERANCE**2 / gamma + rounding
     point = list(_line_search(problem)(now, inputs, span * solution[: problem.size], 1.0, allowed, q))
     kkt = problem.residual(*point[:3], new_dual[problem.variables :], gamma, lower, upper)
     return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q], [*point, new_dual, kkt])
