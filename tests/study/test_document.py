@@ -15,7 +15,7 @@ from chargetune.study.document import (
     space_to_json,
 )
 
-SCORE = Score(-1.5, -2.0, {"voltage": 0.001}, {"voltage": 5e-4}, {"t80_min": None, "t95_min": 36.2})
+SCORE = Score(-1.5, -2.0, {"voltage": 0.001}, {"voltage": 5e-4}, {"t80_min": None, "t95_min": 36.2}, {"voltage": (None, 0.001)})
 
 
 def test_score_and_space_come_back_equal():
@@ -24,15 +24,15 @@ def test_score_and_space_come_back_equal():
 
 
 NO_NUMBERS = [float("nan"), float("inf"), "1", True, 1j]
-NO_SCORES = [(f, v) for f in ("objective", "performance", "excess", "tolerance", "metrics") for v in NO_NUMBERS]
-# None has a meaning in metrics, and only there.
+NO_SCORES = [(f, v) for f in ("objective", "performance", "excess", "tolerance", "metrics", "profile") for v in NO_NUMBERS]
+# None has a meaning in metrics and profile, and only there.
 NO_SCORES += [(f, None) for f in ("objective", "performance", "excess", "tolerance")]
 
 
 @pytest.mark.parametrize(("field", "value"), NO_SCORES)
 def test_score_refuses_what_is_no_finite_number(field, value):
-    fields = {"objective": 1.0, "performance": 1.0, "excess": {}, "tolerance": {}, "metrics": {}}
-    fields[field] = {"v": value} if isinstance(fields[field], dict) else value
+    fields = {"objective": 1.0, "performance": 1.0, "excess": {}, "tolerance": {}, "metrics": {}, "profile": {}}
+    fields[field] = {"v": (0.0, value) if field == "profile" else value} if isinstance(fields[field], dict) else value
     with pytest.raises(ValueError, match=rf"score\.{field}.* = .*, allowed is a finite number"):
         score_to_json(Score(**fields))
 

@@ -1,4 +1,5 @@
 import os
+import signal
 import time
 
 import pytest
@@ -11,7 +12,7 @@ from chargetune.study.study import WorkerError
 
 def environment(_):
     time.sleep(0.2)
-    return os.environ["OMP_NUM_THREADS"], os.getpid()
+    return os.environ["OMP_NUM_THREADS"], signal.getsignal(signal.SIGINT), os.getpid()
 
 
 def test_processes_give_the_trials_of_this_process(store, tmp_path):
@@ -35,17 +36,18 @@ def test_a_lost_worker_is_told_and_its_trials_can_be_run_again(store, tmp_path):
 def test_what_does_not_pickle_is_refused_before_the_first_trial(store):
     with open_study(store) as study, process_executor(1) as pool:
         with pytest.raises(ValueError, match="does not go to another process"):
-            study.run(lambda theta, seed: None, 4, executor=pool)
+            study.run(lambda *_: None, 4, executor=pool)
         assert study.trials() == []
 
 
-def test_workers_have_one_thread_and_this_process_keeps_its_own_setting(monkeypatch):
+def test_workers_have_one_thread_ignore_ctrl_c_and_this_process_keeps_its_own_setting(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with process_executor(2) as pool:
         found = list(pool.map(environment, range(4)))
-    assert {threads for threads, _ in found} == {"1"}
-    assert len({process for _, process in found}) == 2
+    assert {threads for threads, *_ in found} == {"1"}
+    assert {on_ctrl_c for _, on_ctrl_c, _ in found} == {signal.SIG_IGN}
+    assert len({process for *_, process in found}) == 2
     assert os.environ["OMP_NUM_THREADS"] == "2"
     assert "OPENBLAS_NUM_THREADS" not in os.environ
 

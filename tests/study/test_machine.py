@@ -86,7 +86,7 @@ class Life(RuleBasedStateMachine):
 
     @rule()
     def other_config(self):
-        with pytest.raises(StudyError, match="config.a: "):
+        with pytest.raises(StudyError, match=r"config\.a: "):
             open_study(self.store, batch=self.batch, config={"a": 1})
 
     @precondition(lambda self: len(self.asked) < 20)
@@ -121,4 +121,4 @@ class Life(RuleBasedStateMachine):
 
 
 TestLife = Life.TestCase
-TestLife.settings = settings(max_examples=25, stateful_step_count=20, deadline=None)
+TestLife.settings = settings(max_examples=15, stateful_step_count=20, deadline=None)

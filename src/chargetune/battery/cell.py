@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,9 @@ class Cell:
         _within("capacity_Ah", self.capacity_Ah, 0.0, CAPACITY_MAX_AH, "Ah", hint="was it given in mAh?")
         _within("coulombic_efficiency", self.coulombic_efficiency, 0.5, 1.0, "")
         _within("current_max_A", self.current_max_A, 0.0, 100.0 * self.capacity_Ah, "A", hint="more than 100 times the capacity in Ah")
+        if self.current_max_A < self.capacity_Ah / 100.0:
+            least = f"at least a hundredth of capacity_Ah = {self.capacity_Ah:g}"
+            raise ValueError(f"cell: current_max_A = {self.current_max_A:g}, allowed is {least} (was the capacity given in mAh?)")
         _within("voltage_min_V", self.voltage_min_V, *VOLTAGE_RANGE_V, "V", hint="was it given in mV?")
         _within("voltage_max_V", self.voltage_max_V, *VOLTAGE_RANGE_V, "V", hint="was it given in mV?")
         if self.voltage_max_V <= self.voltage_min_V:
@@ -71,14 +75,15 @@ class Cell:
                     _within(f"{name}[{i}]", value, 0.0, RESISTANCE_MAX_OHM, "ohm", hint="was it given in milliohm?")
         if len(self.ocv_V) != len(self.ocv_soc):
             raise ValueError(f"cell: ocv_V has {len(self.ocv_V)} values, expected {len(self.ocv_soc)}, one for each entry of ocv_soc")
-        for i, (low, high) in enumerate(zip(self.ocv_V, self.ocv_V[1:], strict=False)):
+        for i, (low, high) in enumerate(pairwise(self.ocv_V)):
             if high <= low:
                 raise ValueError(f"cell: ocv_V[{i + 1}] = {high:g} must be more than ocv_V[{i}] = {low:g}; the OCV increases with SOC")
         _within("ocv_V[0]", self.ocv_V[0], *VOLTAGE_RANGE_V, "V", hint="was it given in mV?")
         _within("ocv_V[-1]", self.ocv_V[-1], *VOLTAGE_RANGE_V, "V", hint="was it given in mV?")
         most = self.ocv_V[-1] + VOLTAGE_ABOVE_FULL_V
         if self.voltage_max_V > most:
-            raise ValueError(f"cell: voltage_max_V = {self.voltage_max_V:g}, allowed is at most {most:g} V, {VOLTAGE_ABOVE_FULL_V:g} V above the OCV of the full cell")
+            why = f"{VOLTAGE_ABOVE_FULL_V:g} V above the OCV of the full cell"
+            raise ValueError(f"cell: voltage_max_V = {self.voltage_max_V:g}, allowed is at most {most:g} V, {why}")
 
 
 def load_cell(path: str | Path) -> Cell:
@@ -116,14 +121,9 @@ def _read(content: bytes, where: str) -> Cell:
         for key in keys:
             if not isinstance(data[name][key], list):
                 raise ValueError(f"cell file {where}: {name}.{key} = {data[name][key]!r}, expected a list of numbers")
+    fields: dict[str, Any] = {key: data[key] for key in top} | {key: tuple(data["ecm"][key]) for key in tables["ecm"]}
     try:
-        return Cell(
-            **{key: data[key] for key in top},
-            **{key: tuple(data["ecm"][key]) for key in tables["ecm"]},
-            ocv_soc=tuple(data["ocv"]["soc"]),
-            ocv_V=tuple(data["ocv"]["V"]),
-            remark=str(data.get("remark", "")),
-        )
+        return Cell(**fields, ocv_soc=tuple(data["ocv"]["soc"]), ocv_V=tuple(data["ocv"]["V"]), remark=str(data.get("remark", "")))
     except ValueError as error:
         raise ValueError(f"cell file {where}: {error}") from error
 
@@ -152,6 +152,6 @@ def _soc_table(name: str, values: tuple[float, ...], least: int) -> None:
     for i, value in enumerate(values):
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"cell: {name}[{i}] = {value:g}, allowed is 0..1 (a fraction, not per cent)")
-    for i, (a, b) in enumerate(zip(values, values[1:], strict=False)):
+    for i, (a, b) in enumerate(pairwise(values)):
         if b <= a:
             raise ValueError(f"cell: {name}[{i + 1}] = {b:g} must be more than {name}[{i}] = {a:g}")

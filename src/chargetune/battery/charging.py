@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
@@ -42,8 +42,8 @@ class Backoff:
     def __post_init__(self) -> None:
         if isinstance(self.nodes, bool) or not isinstance(self.nodes, int) or not 2 <= self.nodes <= 50:
             raise ValueError(f"backoff: nodes = {self.nodes!r}, allowed is an integer in [2, 50]")
-        if not -1.0 <= self.lower_V <= 0.0 or not 0.0 < self.upper_V <= 1.0:
-            raise ValueError(f"backoff: [{self.lower_V!r}, {self.upper_V!r}] V, allowed is lower_V in [-1, 0] and upper_V in (0, 1]")
+        _check("backoff: lower_V", self.lower_V, -1.0, 0.0, "V")
+        _check("backoff: upper_V", self.upper_V, 0.0, 1.0, "V", open_low=True)
         if self.at not in ("measured", "predicted"):
             raise ValueError(f"backoff: at = {self.at!r}, allowed is 'measured' or 'predicted'")
 
@@ -71,8 +71,8 @@ class ResistanceRatio:
     def __post_init__(self) -> None:
         if self.of not in ("R0", "R1"):
             raise ValueError(f"resistance ratio: of = {self.of!r}, allowed is 'R0' or 'R1'")
-        if not 0.0 < self.lower < 1.0 < self.upper <= 100.0:
-            raise ValueError(f"resistance ratio of {self.of}: [{self.lower!r}, {self.upper!r}], allowed is 0 < lower < 1 < upper <= 100")
+        _check(f"resistance ratio of {self.of}: lower", self.lower, 0.001, 0.999, "")
+        _check(f"resistance ratio of {self.of}: upper", self.upper, 1.001, 100.0, "")
 
     @property
     def name(self) -> str:
@@ -90,7 +90,7 @@ class ChargingProblem:
     ``overpotential``: "model" propagates U1 by the controller's own model, "exact" gives it the plant's.
     Objective of the paper: G = -sum_{k=0..K} c1 (z_d - z_k)^2 - sum_{k<K} max(0, V_k - v_max)^2, V_k the larger of the
     voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; the
-    voltage limits are scored on their own.
+    voltage limits are scored on their own, the upper one also in ``soc_windows`` equal parts of the SOC.
     """
 
     plant_cell: Cell
@@ -110,47 +110,56 @@ class ChargingProblem:
     penalty_per_V: float = 1e3
     c1: float = 1e-5
     tolerance_V: float = 5e-4
-    sensors: Sensors = Sensors()
+    soc_windows: int = 5
+    sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
         cell = self.plant_cell
-        for name, value in (("current_max_A", cell.current_max_A), ("voltage_max_V", cell.voltage_max_V), ("voltage_min_V", cell.voltage_min_V)):
+        for name in ("current_max_A", "voltage_max_V", "voltage_min_V"):
             if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
+                object.__setattr__(self, name, getattr(cell, name))
         _check("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
-        _check("soc_start", self.soc_start, 0.0, 1.0, "")
-        _check("soc_target", self.soc_target, 0.0, 1.0, "")
-        _check("current_min_A", self.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
-        _check("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
-        _check("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
-        _check("voltage_min_V", self.voltage_min_V, 0.0, cell.voltage_max_V, "V")
+        start = _check("soc_start", self.soc_start, 0.0, 1.0, "")
+        target = _check("soc_target", self.soc_target, 0.0, 1.0, "")
+        least = _check("current_min_A", self.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
+        most = _check("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
+        highest = _check("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
+        lowest = _check("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, "V")
         _check("penalty_per_V", self.penalty_per_V, 0.0, 1e9, "", open_low=True)
         _check("c1", self.c1, 0.0, 1.0, "", open_low=True)
         _check("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")
-        assert self.current_max_A is not None and self.voltage_max_V is not None and self.voltage_min_V is not None
-        for name, low, high in (("steps", 1, 1_000_000), ("horizon", 1, 50)):
+        for name, low, high in (("steps", 1, 1_000_000), ("horizon", 1, 50), ("soc_windows", 1, 50)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise ValueError(f"{name} = {value!r}, allowed is an integer in [{low}, {high}]")
-        if self.mismatch_seed is not None and (isinstance(self.mismatch_seed, bool) or not isinstance(self.mismatch_seed, int) or self.mismatch_seed < 0):
-            raise ValueError(f"mismatch_seed = {self.mismatch_seed!r}, allowed is an integer >= 0")
+        seed = self.mismatch_seed
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+            raise ValueError(f"mismatch_seed = {seed!r}, allowed is an integer >= 0")
         if self.overpotential not in ("model", "exact"):
             raise ValueError(f"overpotential = {self.overpotential!r}, allowed is 'model' or 'exact'")
-        if self.current_min_A >= self.current_max_A:
-            raise ValueError(f"current_min_A = {self.current_min_A:g} must be less than current_max_A = {self.current_max_A:g}")
-        if self.voltage_min_V >= self.voltage_max_V:
-            raise ValueError(f"voltage_min_V = {self.voltage_min_V:g} must be less than voltage_max_V = {self.voltage_max_V:g}")
-        if self.soc_target <= self.soc_start:
-            raise ValueError(f"soc_target = {self.soc_target:g} must be more than soc_start = {self.soc_start:g}")
-        resting = float(np.interp(self.soc_start, cell.ocv_soc, cell.ocv_V))
-        if resting >= self.voltage_max_V:
-            raise ValueError(f"soc_start = {self.soc_start:g}: the resting voltage {resting:.3f} V is not below voltage_max_V = {self.voltage_max_V:g}")
-        shortest = min(r * c for r, c in zip(cell.R1_ohm, cell.C1_F, strict=True))
-        if shortest < self.sampling_time_s / 20:
-            raise ValueError(f"the time constant R1 C1 = {shortest:.3g} s is far below sampling_time_s = {self.sampling_time_s:g} s; allowed is at least a twentieth")
-        if self.backoff is not None and self.voltage_max_V - self.backoff.upper_V <= resting:
-            least = self.voltage_max_V - resting
-            raise ValueError(f"backoff: upper_V = {self.backoff.upper_V:g} V forbids any charging from soc_start; allowed is less than {least:.3g} V")
+        tuned = [ratio.of for ratio in self.ratios]
+        if len(set(tuned)) < len(tuned):
+            raise ValueError(f"ratios = {tuned}, allowed is each resistance once")
+        if least >= most:
+            raise ValueError(f"current_min_A = {least:g} must be less than current_max_A = {most:g}")
+        if lowest >= highest:
+            raise ValueError(f"voltage_min_V = {lowest:g} must be less than voltage_max_V = {highest:g}")
+        if target <= start:
+            raise ValueError(f"soc_target = {target:g} must be more than soc_start = {start:g}")
+        self._check_physics(start, highest)
+
+    def _check_physics(self, start: float, highest: float) -> None:
+        cell = self.plant_cell
+        resting = float(np.interp(start, cell.ocv_soc, cell.ocv_V))
+        if resting >= highest:
+            raise ValueError(f"soc_start = {start:g}: the resting voltage {resting:.3f} V is not below voltage_max_V = {highest:g}")
+        shortest, least = min(r * c for r, c in zip(cell.R1_ohm, cell.C1_F, strict=True)), self.sampling_time_s / 20
+        if shortest < least:
+            what = f"sampling_time_s = {self.sampling_time_s:g} s; allowed is at least a twentieth, {least:.3g} s"
+            raise ValueError(f"the time constant R1 C1 = {shortest:.3g} s is far below {what}")
+        if self.backoff is not None and highest - self.backoff.upper_V <= resting:
+            allowed = f"allowed is less than {highest - resting:.3g} V"
+            raise ValueError(f"backoff: upper_V = {self.backoff.upper_V:g} V forbids any charging from soc_start; {allowed}")
 
     @cached_property
     def controller_cell(self) -> Cell:
@@ -218,18 +227,19 @@ class ChargingProblem:
         """The verdict on what was measured. Raises ValueError when a measurement is not a number."""
         start, end = episode.signal("voltage_V")
         _, soc = episode.signal("soc")
-        assert self.voltage_max_V is not None and self.voltage_min_V is not None
         highest, lowest = np.maximum(start, end), np.minimum(start, end)
+        above, below = highest - (self.voltage_max_V or 0.0), (self.voltage_min_V or 0.0) - lowest
         if not (len(soc) and np.all(np.isfinite(highest)) and np.all(np.isfinite(soc))):
             raise ValueError("the episode has no score: a measured voltage or SOC is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        over = np.maximum(0.0, highest - self.voltage_max_V) ** 2
+        over = np.maximum(0.0, above) ** 2
         return Score(
             objective=-float(np.mean(deficit)),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
-            excess={"voltage_max_V": float(np.max(highest) - self.voltage_max_V), "voltage_min_V": float(self.voltage_min_V - np.min(lowest))},
+            excess={"voltage_max_V": float(np.max(above)), "voltage_min_V": float(np.max(below))},
             tolerance={"voltage_max_V": self.tolerance_V, "voltage_min_V": self.tolerance_V},
-            metrics=charging_metrics(episode, self.voltage_max_V, self.soc_start),
+            metrics=charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start),
+            profile={"voltage_max_V": _by_window(soc, above, self.soc_windows)},
         )
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:
@@ -237,11 +247,21 @@ class ChargingProblem:
         episode = self.episode(theta, seed)
         if episode.ending is not Ending.DONE:
             return None, episode, f"{episode.ending.value}: {episode.message}"
-        return self.score(episode), episode, episode.ending.value
+        try:
+            return self.score(episode), episode, episode.ending.value
+        except ValueError as error:
+            return None, episode, f"{Ending.SENSOR.value}: {error}"
 
 
-def _check(name: str, value: float | None, low: float, high: float, unit: str, *, open_low: bool = False) -> None:
+def _by_window(soc: NDArray[np.float64], excess: NDArray[np.float64], windows: int) -> tuple[float | None, ...]:
+    """The worst excess in each of ``windows`` equal parts of 0..1 in SOC; None where no interval ended."""
+    index = np.clip((soc * windows).astype(int), 0, windows - 1)
+    return tuple(float(np.max(excess[index == i])) if np.any(index == i) else None for i in range(windows))
+
+
+def _check(name: str, value: float | None, low: float, high: float, unit: str, *, open_low: bool = False) -> float:
     ok = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     if not ok or value is None or not (low < value if open_low else low <= value) or value > high:
         bracket = "(" if open_low else "["
         raise ValueError(f"{name} = {value!r}, allowed is {bracket}{low:g}, {high:g}] {unit}".rstrip())
+    return float(value)

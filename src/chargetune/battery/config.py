@@ -80,9 +80,10 @@ class SensorTable(_Table):
 
 
 class ObjectiveTable(_Table):
-    """c1 of the paper's scalar performance G."""
+    """c1 of the paper's scalar performance G; SOC windows in which the voltage excess is told to the tuner."""
 
     c1: float = 1e-5
+    soc_windows: int = 5
 
 
 class BackoffTable(_Table):
@@ -139,7 +140,7 @@ class Config(_Table):
             backoff=Backoff(**theta.backoff.model_dump()) if theta.backoff else None,
             ratios=ratios,
             sensors=sensors,
-            c1=self.objective.c1,
+            **self.objective.model_dump(),
             **self.controller.model_dump(),
             **self.limits.model_dump(),
             **self.episode.model_dump(),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 
 from chargetune.battery.cell import Cell
@@ -34,7 +36,7 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0) -> Model:
     nodes = table_nodes(cell.soc)
     low, high = int(cell.soc[0] > 0.0), int(cell.soc[-1] < 1.0)
 
-    def table(z: ca.SX, values: ca.SX) -> ca.SX:
+    def table(z: ca.SX, values: ca.SX) -> Any:
         ends = [values[0]] * low, [values[-1]] * high
         spline = natural_spline(z, nodes, ca.vertcat(*ends[0], values, *ends[1]))
         # Between very unequal nodes a cubic spline dips below zero, where the circuit would be unstable.

@@ -78,9 +78,9 @@ def tune_command(
         screen.print(f"[dim]{problem.plant_cell.remark}[/]")
     untuned = everything[0].score if everything else None
     screen.print(metrics_table({"untuned": untuned, "tuned": best.score if best else None}, problem))
-    if best is None:
-        screen.print("[red]No trial kept the limits.[/] More trials, a wider theta, or a more cautious start may help.")
-    else:
+    if best is None or not best.feasible:
+        screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
+    if best is not None:
         units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
         screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
     screen.print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))

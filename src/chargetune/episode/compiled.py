@@ -6,19 +6,22 @@ thetas, seeds and mismatches builds it once. It gives the same trajectory as `ru
 
 from __future__ import annotations
 
+import hashlib
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.control.controller import Controller
 from chargetune.control.mpc import begin, cached, control_step, problem_of
-from chargetune.control.qp import daqp, daqp_warm, warm_sources
-from chargetune.episode.episode import Ending, Episode, Trip, ending_at, signal_indices
+from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
+from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
+from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
@@ -36,9 +39,10 @@ class CompiledEpisode:
     prepare_plant: ca.Function
 
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
-        """One closed loop; the same as `run_episode` on this plant."""
+        """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
         controller, plant = self.controller, self.plant
         values = controller.theta_vector(theta)
+        check_run(plant, self.steps, seed, trips)
         errors, process = disturbances(plant, self.steps, seed)
         _, _, resolution = plant.sensors.vectors(plant.outputs)
         memory = begin(controller)
@@ -55,7 +59,7 @@ class CompiledEpisode:
             input_units=tuple(s.unit for s in plant.inputs),
             output_units=tuple(s.unit for s in plant.outputs),
             estimate_names=controller.model.state_names,
-            time_s=np.arange(self.steps) * plant.sampling_time_s,
+            time_s=np.arange(self.steps, dtype=np.float64) * plant.sampling_time_s,
             input=u,
             output_start=start,
             output_end=end,
@@ -68,20 +72,34 @@ class CompiledEpisode:
             true_end=true_end,
             state=np.vstack([plant.start_state, state]),
         )
-        return _until_not_finite(episode, trips)
+        at_rest = tripped(plant, replace(plant).reset(seed), trips) if trips else ""
+        return episode.cut(0, Ending.LIMIT, at_rest) if at_rest else _until_not_finite(episode, trips)
 
 
 def compiled_episode(controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None) -> CompiledEpisode:
     """The function for this controller and plant, built and compiled once a content.
 
-    ``compiled=None`` compiles when there is a C compiler, ``False`` uses CasADi's virtual machine, ``True`` insists.
+    ``compiled=None`` compiles when there is a C compiler, and where that fails warns and uses CasADi's virtual machine,
+    which is slower and gives the same result; ``False`` uses the virtual machine; ``True`` raises RuntimeError or
+    OSError when the function cannot be compiled.
     """
-    use = find_compiler() is not None if compiled is None else compiled
+    check_run(plant, steps, 0, ())
     indices = tuple(signal_indices(controller, plant))
-    own = (plant.model.f.serialize(), plant.model.h.serialize(), plant.sensors.delay_steps)
-    key = f"episode {controller.structure} {hash(own)} {steps} {use} {indices}"
-    function, prepare = cached(key, lambda: _build(controller, plant, indices, steps, use))
-    return CompiledEpisode(controller, plant, steps, use, function, prepare)
+    own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.sensors.delay_steps}"
+    use = find_compiler() is not None if compiled is None else compiled
+    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices}"
+
+    def build() -> tuple[ca.Function, ca.Function, bool]:
+        try:
+            return *(_compiled if use else _built)(controller, plant, indices, steps), use
+        except (RuntimeError, OSError) as error:
+            if compiled or not use:
+                raise
+            warnings.warn(f"episodes run on the virtual machine, about 8 times slower: {error}", RuntimeWarning, stacklevel=4)
+            return *_built(controller, plant, indices, steps), False
+
+    function, prepare, used = cached(key, build)
+    return CompiledEpisode(controller, plant, steps, used, function, prepare)
 
 
 def simulate(
@@ -99,20 +117,39 @@ def simulate(
 
 
 def _until_not_finite(episode: Episode, trips: Sequence[Trip]) -> Episode:
-    assert episode.state is not None
-    lost = ~np.all(np.isfinite(episode.state[1:]), axis=1)
+    state = episode.arrays()["state"]
+    lost = ~np.all(np.isfinite(state[1:]), axis=1)
     if lost.any():
         # Step by step the plant refuses this interval, so it is not part of the episode.
         at = int(np.argmax(lost))
-        message = f"the plant's state is not finite after step {at}: {episode.state[at + 1].tolist()}"
+        message = f"the plant's state is not finite after step {at}: {state[at + 1].tolist()}"
         before = ending_at(episode.cut(at, Ending.DONE, ""), trips)
         return before if before.ending is not Ending.DONE else episode.cut(at, Ending.PLANT, message)
     return ending_at(episode, trips)
 
 
-def _build(controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, compiled: bool) -> tuple[ca.Function, ca.Function]:
+@lru_cache(maxsize=64)
+def _content(function: ca.Function) -> str:
+    # Serialising takes a quarter of the time of an episode, and a study has one and the same model all along.
+    return hashlib.sha256(function.serialize().encode()).hexdigest()
+
+
+def _compiled(controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int) -> tuple[ca.Function, ca.Function]:
+    """(the episode as machine code, p -> q of the plant)."""
     problem = problem_of(controller)
-    control = control_step(problem, daqp_warm if compiled else daqp)
+    episode, prepare = _built(controller, plant, indices, steps, daqp_warm)
+    generator = ca.CodeGenerator("episode", {"with_header": False})
+    generator.add(episode)
+    sources, defines = warm_sources(problem.variables, len(problem.groups))
+    library = compile_library("episode", (generator.dump(), *sources), defines)
+    return ca.external("episode", str(library)), prepare
+
+
+def _built(
+    controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, qp: QPSolver = daqp
+) -> tuple[ca.Function, ca.Function]:
+    """(the episode for CasADi's virtual machine, p -> q of the plant)."""
+    control = control_step(problem_of(controller), qp)
     transition, output, prepare = _plant_functions(plant)
     nx, ny, delay = len(plant.model.states), len(plant.outputs), plant.sensors.delay_steps
 
@@ -142,13 +179,7 @@ def _build(controller: Controller, plant: SimulatedPlant, indices: tuple[int, ..
     episode = ca.Function(
         "episode", [x0, memory, last, warm, q, plant_q, resolution, y_error, *errors], [states, inputs, *recorded], {"cse": True}
     )
-    if not compiled:
-        return episode, prepare
-    generator = ca.CodeGenerator("episode", {"with_header": False})
-    generator.add(episode)
-    sources, defines = warm_sources(problem.variables, len(problem.groups))
-    library = compile_library("episode", (generator.dump(), *sources), defines)
-    return ca.external("episode", str(library)), prepare
+    return episode, prepare
 
 
 def _plant_functions(plant: SimulatedPlant) -> tuple[ca.Function, ca.Function, ca.Function]:

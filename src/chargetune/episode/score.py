@@ -21,6 +21,9 @@ class Score:
         positive is a violation, negative the smallest distance that was kept.
     tolerance
         For each limit the excess still called "kept" (measurement resolution, solver tolerance), same unit.
+    profile
+        Optional, for a limit of ``excess``: its worst excess in each of several windows of the episode (SOC, position),
+        None where the episode never was. The largest entry is the limit's excess. A tuner learns much more from it.
     metrics
         Named figures with the unit in the name (``t80_min``); None where the episode never got there.
     """
@@ -30,6 +33,7 @@ class Score:
     excess: Mapping[str, float]
     tolerance: Mapping[str, float]
     metrics: Mapping[str, float | None] = field(default_factory=dict)
+    profile: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
 
     @property
     def feasible(self) -> bool:

@@ -30,8 +30,10 @@ class Sensors:
     def __post_init__(self) -> None:
         for name in ("noise_sd", "bias", "resolution"):
             for signal, value in getattr(self, name).items():
-                if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value) or (name != "bias" and value < 0):
-                    raise ValueError(f"sensors: {name} of {signal} = {value!r}, allowed is a finite number{'' if name == 'bias' else ' >= 0'}")
+                number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+                if not number or (name != "bias" and value < 0):
+                    allowed = "a finite number" if name == "bias" else "a finite number >= 0"
+                    raise ValueError(f"sensors: {name} of {signal} = {value!r}, allowed is {allowed}")
         if isinstance(self.delay_steps, bool) or not isinstance(self.delay_steps, int) or not 0 <= self.delay_steps <= 100:
             raise ValueError(f"sensors: delay_steps = {self.delay_steps!r}, allowed is an integer in [0, 100]")
 

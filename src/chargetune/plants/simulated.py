@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,7 +51,8 @@ class SimulatedPlant:
             if unknown:
                 raise ValueError(f"plant: {label} names unknown {unknown}, allowed are {', '.join(self.model.state_names)}")
             for name, value in names.items():
-                if not np.isfinite(value) or (label == "process_noise_sd" and value < 0):
+                number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+                if not number or (label == "process_noise_sd" and value < 0):
                     raise ValueError(f"plant: {label} of {name} = {value!r}, allowed is a finite number{' >= 0' if 'sd' in label else ''}")
         self.sensors.vectors(self.outputs)
 

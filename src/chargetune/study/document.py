@@ -92,12 +92,16 @@ def score_to_json(score: Score) -> dict[str, Any]:
         "excess": {name: _finite(v, f"score.excess[{name}]") for name, v in score.excess.items()},
         "tolerance": {name: _finite(v, f"score.tolerance[{name}]") for name, v in score.tolerance.items()},
         "metrics": {name: None if v is None else _finite(v, f"score.metrics[{name}]") for name, v in score.metrics.items()},
+        "profile": {
+            name: [None if v is None else _finite(v, f"score.profile[{name}]") for v in values] for name, values in score.profile.items()
+        },
     }
 
 
 def score_from_json(data: Mapping[str, Any]) -> Score:
     """Inverse of `score_to_json`."""
-    return Score(**data)
+    profile = {name: tuple(values) for name, values in data.get("profile", {}).items()}
+    return Score(**{**data, "profile": profile})
 
 
 def space_to_json(space: ParameterSpace) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_perfo
 __all__ = ["Proposer", "Study", "StudyError", "WorkerError"]
 
 
+# The same as learning's Tuner, written again because importing that folder loads torch, which showing a study does not need.
 class Proposer(Protocol):
     """A tuner: a pure function of space, trials and n. Same arguments, same thetas, bit for bit."""
 

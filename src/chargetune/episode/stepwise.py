@@ -1,0 +1,157 @@
+"""One closed loop step by step, on any plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chargetune.control.controller import Controller
+from chargetune.control.mpc import act, begin
+from chargetune.control.sqp import SolveStatus
+from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
+from chargetune.plants.plant import Measurement, Plant, PlantError
+
+__all__ = ["check_run", "run_episode", "signal_indices"]
+
+
+def run_episode(
+    controller: Controller,
+    plant: Plant,
+    *,
+    steps: int,
+    theta: ArrayLike | None = None,
+    seed: int = 0,
+    trips: Sequence[Trip] = (),
+) -> Episode:
+    """Run one closed loop step by step on any plant. It always returns: a failure is the episode's ending.
+
+    The plant is closed at the end, whatever happened, and before anything else is done with the result. What the plant
+    raises ends the episode as PLANT, what the controller raises as SOLVER; the intervals until then are kept. A plant
+    that is outside a trip at rest gets no input. Raises ValueError, before the plant is touched, when controller,
+    plant, theta, steps, seed and trips do not fit.
+    """
+    values = controller.theta_vector(theta)
+    indices = signal_indices(controller, plant)
+    check_run(plant, steps, seed, trips)
+    records: list[tuple[NDArray[np.float64], Measurement, SolveStatus, float, int, NDArray[np.float64]]] = []
+    ending, message = Ending.DONE, ""
+    first: Measurement | None = None
+    blind = broken = 0
+    try:
+        first = _asked(plant, partial(plant.reset, seed))
+        memory, measurement = begin(controller), first
+        message = tripped(plant, first, trips)
+        ending = Ending.LIMIT if message else Ending.DONE
+        for _ in range(0 if message else steps):
+            u, memory, info = act(controller, measurement.received[indices], values, memory)
+            measurement = _asked(plant, partial(plant.step, u))
+            records.append((u, measurement, info.status, info.kkt, info.iterations, info.estimate))
+            blind = blind + 1 if not np.all(np.isfinite(measurement.end)) else 0
+            broken = broken + 1 if info.status == SolveStatus.FALLBACK else 0
+            if blind >= BLIND_MAX or broken >= BLIND_MAX or tripped(plant, measurement, trips):
+                break
+    except PlantError as error:
+        ending, message = Ending.PLANT, str(error)
+    except KeyboardInterrupt:
+        ending, message = Ending.INTERRUPTED, "interrupted by the user"
+    except Exception as error:  # noqa: BLE001 - whatever a controller raises, the plant has to be left safe and the trace kept
+        ending, message = Ending.SOLVER, f"the controller raised {type(error).__name__}: {error}"
+    finally:
+        unsafe = _closed(plant)
+    episode = _assemble(controller, plant, first, records, ending, message)
+    episode = ending_at(episode, trips) if ending is Ending.DONE else episode
+    if unsafe:
+        return replace(episode, ending=Ending.PLANT, message="; ".join(filter(None, (unsafe, episode.message))))
+    return episode
+
+
+def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
+    """What the plant answers; anything it raises, and an answer of the wrong shape, is a `PlantError`."""
+    try:
+        measurement = call()
+    except PlantError:
+        raise
+    except Exception as error:
+        raise PlantError(f"the plant raised {type(error).__name__}: {error}") from error
+    expected = (len(plant.outputs),)
+    for name in ("start", "end", "received"):
+        shape = np.shape(getattr(measurement, name))
+        if shape != expected:
+            raise PlantError(f"the plant's measurement {name} has shape {shape}, expected {expected}")
+    return measurement
+
+
+def _closed(plant: Plant) -> str:
+    """Close the plant; why that failed, or nothing."""
+    try:
+        plant.close()
+    except Exception as error:  # noqa: BLE001 - a plant that cannot be closed is the news that must not be lost
+        return f"the plant could not be closed: {type(error).__name__}: {error}"
+    return ""
+
+
+def _assemble(
+    controller: Controller, plant: Plant, first: Measurement | None, records: Sequence[Any], ending: Ending, message: str
+) -> Episode:
+    ny, nu, nx = len(plant.outputs), len(plant.inputs), len(controller.model.states)
+    count = len(records)
+
+    def stack(values: list[Any], width: int) -> NDArray[np.float64]:
+        return np.array(values, dtype=float).reshape(count, width)
+
+    measured = [r[1] for r in records]
+    states = [m.state for m in (*([first] if first else []), *measured)]
+    simulated = bool(states) and all(s is not None for s in states) and all(m.true_start is not None for m in measured)
+    return Episode(
+        sampling_time_s=plant.sampling_time_s,
+        input_names=tuple(s.name for s in plant.inputs),
+        output_names=tuple(s.name for s in plant.outputs),
+        input_units=tuple(s.unit for s in plant.inputs),
+        output_units=tuple(s.unit for s in plant.outputs),
+        estimate_names=controller.model.state_names,
+        time_s=np.arange(count, dtype=np.float64) * plant.sampling_time_s,
+        input=stack([r[0] for r in records], nu),
+        output_start=stack([m.start for m in measured], ny),
+        output_end=stack([m.end for m in measured], ny),
+        estimate=stack([r[5] for r in records], nx),
+        status=np.array([r[2] for r in records], dtype=np.int64),
+        kkt=np.array([r[3] for r in records], dtype=float),
+        iterations=np.array([r[4] for r in records], dtype=np.int64),
+        ending=ending,
+        message=message,
+        true_start=stack([m.true_start for m in measured], ny) if simulated else None,
+        true_end=stack([m.true_end for m in measured], ny) if simulated else None,
+        state=np.array(states, dtype=float) if simulated else None,
+    )
+
+
+def signal_indices(controller: Controller, plant: Plant) -> list[int]:
+    """Where the signals that the estimator reads stand among the plant's outputs; ValueError when the two do not fit."""
+    names = [s.name for s in plant.outputs]
+    needed = controller.estimator.signals(controller.model)
+    missing = [n for n in needed if n not in names]
+    if missing:
+        raise ValueError(f"the estimator reads {missing}, which the plant does not measure; it has {', '.join(names)}")
+    inputs = [s.name for s in plant.inputs]
+    if inputs != list(controller.model.input_names):
+        raise ValueError(f"the plant's inputs {inputs} are not the controller's {list(controller.model.input_names)}")
+    ours, theirs = controller.model.sampling_time_s, plant.sampling_time_s
+    if theirs != ours:
+        raise ValueError(f"sampling_time_s: plant {theirs}, controller {ours}; they must be equal")
+    return [names.index(n) for n in needed]
+
+
+def check_run(plant: Plant, steps: int, seed: int, trips: Sequence[Trip]) -> None:
+    """Raises ValueError when an episode cannot be run with these: field, value and what is allowed."""
+    for name, value, least in (("steps", steps, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} = {value!r}, allowed is an integer >= {least}")
+    names = [s.name for s in plant.outputs]
+    unknown = sorted({trip.signal for trip in trips} - set(names))
+    if unknown:
+        raise ValueError(f"trip of unknown {unknown}, allowed are {', '.join(names)}")

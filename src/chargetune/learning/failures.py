@@ -1,0 +1,34 @@
+"""Keeping away from where trials failed, without inventing a score for them."""
+
+from __future__ import annotations
+
+import torch
+from botorch.acquisition import AcquisitionFunction
+from botorch.utils.transforms import t_batch_mode_transform
+
+__all__ = ["AwayFromFailures"]
+
+# Radius of the region a failure speaks for, as a share of the cube's diagonal.
+RADIUS = 0.05
+
+
+class AwayFromFailures(AcquisitionFunction):
+    """log a(x) + sum_j log(1 - exp(-|x - x_j|^2 / (2 r^2))) with failed trials x_j and r = 0.05 sqrt(d).
+
+    The second term is the log probability of success under independent failure regions that fade with distance.
+    """
+
+    def __init__(self, base: AcquisitionFunction, failed: torch.Tensor) -> None:
+        super().__init__(model=base.model)
+        self.base = base
+        self.register_buffer("failed", failed)
+
+    @t_batch_mode_transform(assert_output_shape=False)
+    def forward(self, X: torch.Tensor) -> torch.Tensor:
+        """X (b, q, d) -> (b,)."""
+        value = self.base(X)
+        if not len(self.failed):
+            return value
+        radius = RADIUS * X.shape[-1] ** 0.5
+        distance = (X[..., None, :] - self.failed).square().sum(-1) / (2 * radius**2)
+        return value + torch.log(-torch.expm1(-distance - 1e-12)).sum(-1).amin(-1)

@@ -1,0 +1,117 @@
+"""How a study came to its result: what each trial was worth, and how far it went beyond the limits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.report.reading import StudyView
+from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, journal_style, legend_above, letter, new_figure
+from chargetune.study.trial import Trial, TrialStatus
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["convergence_figure", "incumbents", "loss", "worst_excess"]
+
+
+def loss(view: StudyView, trial: Trial) -> float:
+    """What the tuner makes small: -objective, for the tuner "ei" -G; NaN without a score."""
+    if trial.score is None:
+        return np.nan
+    return -(trial.score.performance if view.tuner == "ei" else trial.score.objective)
+
+
+def worst_excess(trial: Trial) -> float:
+    """The largest excess over all limits, in their own unit; NaN without a score."""
+    return np.nan if trial.score is None else max(trial.score.excess.values(), default=np.nan)
+
+
+def incumbents(view: StudyView) -> NDArray[np.float64]:
+    """The smallest loss up to each trial, among those within the limits (for "ei", whose G contains them, among all); NaN before."""
+    counted = [t.score is not None and (view.tuner == "ei" or t.score.feasible) for t in view.trials]
+    losses = [loss(view, t) if ok else np.nan for t, ok in zip(view.trials, counted, strict=True)]
+    return np.asarray(np.fmin.accumulate(losses), dtype=float)
+
+
+def convergence_figure(view: StudyView) -> Figure:
+    """Upper panel: loss of each trial and the incumbent. Lower panel: worst excess, logarithmic beyond 1 unit of its axis."""
+    with journal_style():
+        from matplotlib.lines import Line2D
+
+        figure, (upper, lower) = new_figure(COLUMN_IN, 3.6, 2, 1, sharex=True)
+        numbers = [t.number for t in view.trials]
+        label, scale = _excess_unit(view)
+        _scales(upper, lower, [loss(view, t) for t in view.trials])
+        marks = _marks(view)
+        for axis, value in ((upper, lambda t: loss(view, t)), (lower, lambda t: scale * worst_excess(t))):
+            for text, trials, style in marks:
+                axis.plot([t.number for t in trials], [value(t) for t in trials], label=text, linestyle="none", **style)
+        failed = [t.number for t in view.trials if t.status is TrialStatus.FAILED]
+        for axis in (upper, lower):
+            if failed:
+                _failed(axis, failed)
+        handles = [Line2D([], [], linestyle="none", label=text, **style) for text, trials, style in marks if trials]
+        if failed:
+            handles.append(Line2D([], [], linestyle="none", marker="x", color="black", markersize=4, label="failed"))
+        best = incumbents(view)
+        if np.isfinite(best).any():
+            handles += upper.plot(numbers, best, color=ORANGE, drawstyle="steps-post", label="best so far", zorder=2)
+        handles.append(lower.axhline(0.0, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, label="limit"))
+        allowed = {v for t in view.trials if t.score is not None for v in t.score.tolerance.values()}
+        if len(allowed) == 1 and allowed != {0.0}:
+            handles.append(lower.axhline(scale * allowed.pop(), color=RED, linestyle=":", linewidth=0.8, label="tolerance"))
+        upper.set_ylabel(_loss_label(view))
+        lower.set_ylabel(f"worst excess ({label})")
+        lower.set_xlabel("trial")
+        letter([upper, lower])
+        legend_above(figure, handles, columns=3)
+    return figure
+
+
+def _scales(upper: Axes, lower: Axes, losses: list[float]) -> None:
+    from matplotlib.ticker import StrMethodFormatter
+
+    positive = np.array(losses)[np.isfinite(losses)]
+    # Below a decade a logarithmic axis says no more than a linear one, and its ticks are harder to read.
+    if positive.size and np.all(positive > 0) and np.max(positive) > 10 * np.min(positive):
+        upper.set_yscale("log")
+    lower.set_yscale("symlog", linthresh=1.0, linscale=0.5)
+    lower.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+
+
+def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:
+    """Label, trials and marker of each kind; kinds differ in shape, not in colour alone."""
+    scored = [t for t in view.trials if t.score is not None]
+    kinds: list[tuple[str, list[Trial], dict[str, Any]]] = [
+        ("within limits", [t for t in scored if t.feasible], {"marker": "o", "color": GREEN, "markersize": 3.5}),
+        ("violating", [t for t in scored if not t.feasible], {"marker": "^", "color": RED, "markersize": 3.5, "fillstyle": "none"}),
+    ]
+    for label, trial, color in (("untuned", view.untuned, BLUE), ("tuned", view.tuned, ORANGE)):
+        if trial is not None and trial.score is not None:
+            ring = {"marker": "o", "color": color, "markersize": 8, "fillstyle": "none", "markeredgewidth": 1.4, "zorder": 4, "clip_on": False}
+            kinds.append((label, [trial], ring))
+    return kinds
+
+
+def _failed(axis: Axes, numbers: list[int]) -> None:
+    # A failed trial has no value, so its mark stands at the foot of the axis.
+    at = axis.get_xaxis_transform()
+    axis.plot(numbers, [0.04] * len(numbers), "x", color="black", markersize=4, transform=at, label="failed")
+
+
+def _loss_label(view: StudyView) -> str:
+    if view.tuner == "ei":
+        return "$-G$"
+    return "−objective" if view.problem is None else "mean of $(z_d - z)^2$"
+
+
+def _excess_unit(view: StudyView) -> tuple[str, float]:
+    """Unit of the lower panel and the factor to it: millivolts when every limit is a voltage."""
+    limits = {name for t in view.trials if t.score is not None for name in t.score.excess}
+    if limits and all(name.endswith("_V") for name in limits):
+        return "mV", 1e3
+    return "unit of the limit", 1.0

@@ -1,0 +1,121 @@
+"""What was learned: the voltage backoff and the resistances of the controller's model, over SOC."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.ecm import FLOOR, table_nodes
+from chargetune.report.reading import StudyView
+from chargetune.report.style import BLUE, COLUMN_IN, GREEN, GREY, ORANGE, RED, cell_note, journal_style, legend_above, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["backoff_figure", "backoff_values", "resistance_figure", "resistance_values", "violated_soc"]
+
+SOC = np.linspace(0.0, 1.0, 201)
+
+
+def backoff_values(problem: ChargingProblem, nodes_V: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
+    """b(z) in V: the natural cubic spline through the backoff's nodes."""
+    assert problem.backoff is not None
+    return np.asarray(CubicSpline(problem.backoff.grid, nodes_V, bc_type="natural")(soc))
+
+
+def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
+    """R(z) in ohm of the circuit model with these node values: natural cubic spline, constant beyond the nodes, kept positive."""
+    values, own = np.asarray(nodes_ohm, dtype=float), problem.plant_cell.soc
+    nodes = table_nodes(own)
+    spline = CubicSpline(nodes, np.interp(nodes, own, values), bc_type="natural")(soc)
+    return np.asarray((spline + np.hypot(spline, FLOOR * values.mean())) / 2)
+
+
+def violated_soc(view: StudyView) -> list[tuple[float, float]]:
+    """The SOC ranges in which the untuned run was above the upper voltage limit by more than the tolerance."""
+    episode = view.episode(view.untuned)
+    if episode is None or view.problem is None or view.problem.voltage_max_V is None:
+        return []
+    voltage, soc = np.stack(episode.signal("voltage_V")), np.stack(episode.signal("soc"))
+    over = np.any(voltage > view.problem.voltage_max_V + view.problem.tolerance_V, axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], over, [False]])))
+    return [(float(soc[0, first]), float(soc[1, beyond - 1])) for first, beyond in edges.reshape(-1, 2)]
+
+
+def backoff_figure(view: StudyView) -> Figure:
+    """b(z) of all trials in mV, with the OCV beside it. Raises ValueError when theta has no backoff."""
+    problem = view.problem
+    if problem is None or problem.backoff is None:
+        raise ValueError(f"study {view.name!r} does not tune a backoff")
+    cell, part = problem.plant_cell, view.space.slices["backoff_V"]
+    grid = problem.backoff.grid
+    with journal_style():
+        figure, (axis,) = new_figure(COLUMN_IN, 2.7)
+        nodes = {label: 1e3 * np.array(theta[part]) for label, theta in _thetas(view).items()}
+        drawn = {label: 1e3 * backoff_values(problem, values / 1e3) for label, values in nodes.items()}
+        handles = _grey(axis, [1e3 * backoff_values(problem, t.theta[part]) for t in view.others])
+        for label, color in (("untuned", BLUE), ("tuned", ORANGE)):
+            if label in drawn:
+                handles += axis.plot(100 * SOC, drawn[label], color=color, label=label, zorder=3)
+                axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
+        beside = axis.twinx()
+        beside.spines["right"].set_visible(True)
+        handles += beside.plot(100 * SOC, PchipInterpolator(cell.ocv_soc, cell.ocv_V)(SOC), color="black", linestyle=":", label="OCV")
+        beside.set_ylabel("OCV (V)")
+        axis.set_ylabel("backoff $b$ (mV)")
+        _finish(figure, axis, view, handles)
+    return figure
+
+
+def resistance_figure(view: StudyView, of: Literal["R0", "R1"]) -> Figure:
+    """R0 or R1 over SOC in milliohm: of the plant, of the untuned and of the tuned controller. Raises ValueError when theta has none."""
+    problem = view.problem
+    if problem is None or of not in [ratio.of for ratio in problem.ratios]:
+        raise ValueError(f"study {view.name!r} does not tune {of}")
+    part = view.space.slices[f"{of}_ratio"]
+    believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
+    true = np.array(getattr(problem.plant_cell, f"{of}_ohm"))
+    with journal_style():
+        figure, (axis,) = new_figure(COLUMN_IN, 2.7)
+        handles = _grey(axis, [1e3 * resistance_values(problem, believed * t.theta[part]) for t in view.others])
+        nodes = {"plant": true, **{label: believed * theta[part] for label, theta in _thetas(view).items()}}
+        for label, color, marker in (("plant", GREEN, "s"), ("untuned", BLUE, "o"), ("tuned", ORANGE, "o")):
+            if label in nodes:
+                handles += axis.plot(100 * SOC, 1e3 * resistance_values(problem, nodes[label]), color=color, label=label, zorder=3)
+                axis.plot(100 * np.array(problem.plant_cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
+        axis.set_ylim(bottom=0.0)
+        axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")
+        _finish(figure, axis, view, handles)
+    return figure
+
+
+def _thetas(view: StudyView) -> dict[str, NDArray[np.float64]]:
+    """theta of the untuned controller, which needs no trial, and of the tuned one."""
+    tuned = view.tuned
+    return {"untuned": view.space.default, **({} if tuned is None else {"tuned": np.array(tuned.theta)})}
+
+
+def _grey(axis: Axes, rows: list[NDArray[np.float64]]) -> list[Any]:
+    from matplotlib.collections import LineCollection
+    from matplotlib.lines import Line2D
+
+    lines = LineCollection([np.column_stack([100 * SOC, row]) for row in rows], colors=GREY, linewidths=0.4, alpha=0.5)
+    axis.add_collection(lines, autolim=False)
+    return [Line2D([], [], color=GREY, linewidth=0.8, label="trials")] if rows else []
+
+
+def _finish(figure: Figure, axis: Axes, view: StudyView, handles: list[Any]) -> None:
+    assert view.problem is not None
+    spans = [axis.axvspan(100 * low, 100 * high, color=RED, alpha=0.1, linewidth=0) for low, high in violated_soc(view)]
+    if spans:
+        spans[0].set_label("untuned over limit")
+        handles.append(spans[0])
+    axis.set_xlim(0.0, 100.0)
+    axis.set_xlabel("SOC (%)")
+    legend_above(figure, handles, columns=3)
+    cell_note(figure, view.problem.plant_cell.name, view.problem.plant_cell.remark)

@@ -1,0 +1,92 @@
+"""What a figure needs of a stored study."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.config import problem_of_document
+from chargetune.battery.reproduce import tuned_trial
+from chargetune.episode.episode import Episode
+from chargetune.model.parameters import ParameterSpace
+from chargetune.study.document import space_from_json
+from chargetune.study.store import Store
+from chargetune.study.trial import Trial, TrialStatus
+
+__all__ = ["StudyView", "read_study"]
+
+
+@dataclass(frozen=True)
+class StudyView:
+    """A study as it stood when it was read. ``problem`` is None when the study is not one of battery charging.
+
+    ``tuner`` is the tuner's name in the configuration, empty when that names none.
+    """
+
+    path: Path
+    name: str
+    tuner: str
+    space: ParameterSpace
+    trials: tuple[Trial, ...]
+    problem: ChargingProblem | None
+
+    @property
+    def untuned(self) -> Trial | None:
+        """The first trial of theta_0, which a tuner asks for first."""
+        default = self.space.default
+        return next((t for t in self.trials if np.array_equal(t.theta, default)), None)
+
+    @property
+    def tuned(self) -> Trial | None:
+        """The study's result: best feasible trial, for the tuner "ei" that of the best performance G; None when there is none."""
+        return tuned_trial(self.trials, self.tuner)
+
+    @property
+    def others(self) -> tuple[Trial, ...]:
+        """Told trials that are neither the untuned nor the tuned one, the failed ones included."""
+        apart = [t.number for t in (self.untuned, self.tuned) if t is not None]
+        return tuple(t for t in self.trials if t.status is not TrialStatus.RUNNING and t.number not in apart)
+
+    def episodes(self, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Episode]]:
+        """Those of ``trials`` that have a trace, each with its episode, read one at a time.
+
+        Raises StoreError for a trace that is not as it was stored, naming the trial.
+        """
+        with Store(self.path, read_only=True) as store:
+            record = store.study(self.name)
+            for trial in trials:
+                trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
+                if trace is not None:
+                    yield trial, Episode.from_arrays(*trace)
+
+    def episode(self, trial: Trial | None) -> Episode | None:
+        """The episode of one trial; None without trial or trace."""
+        return None if trial is None else next((episode for _, episode in self.episodes([trial])), None)
+
+
+def read_study(store_path: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
+    """Read a study, or its first ``trials`` trials, without writing to the store.
+
+    Raises StoreError for a file that is no store and for an unknown study, naming those that there are; ValueError for a study
+    without trials.
+    """
+    path = Path(store_path)
+    with Store(path, read_only=True) as store:
+        record = store.study(name)
+        found = tuple(store.trials(record.id)[:trials])
+    if not found:
+        raise ValueError(f"{path}: study {name!r} has no trials yet, so there is nothing to draw")
+    config = record.identity["config"]
+    return StudyView(
+        path=path,
+        name=name,
+        tuner=str(config.get("study", {}).get("tuner", "")),
+        space=space_from_json(record.identity["space"]),
+        trials=found,
+        problem=problem_of_document(config) if "cell" in config else None,
+    )

@@ -1,0 +1,106 @@
+"""SOC, current and voltage of every trial over time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.episode.episode import Episode
+from chargetune.report.reading import StudyView
+from chargetune.report.style import BLUE, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, legend_above, letter, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["curves", "trajectories_figure"]
+
+Curve = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def curves(episode: Episode) -> dict[str, Curve]:
+    """(minutes, values) of SOC in per cent, current in A and voltage in V, as measured.
+
+    Current and voltage have two points an interval, at its start and at its end: both jump where the current does.
+    """
+    start, end = episode.signal("soc")
+    step = episode.sampling_time_s
+    ends = np.stack([episode.time_s, episode.time_s + step], axis=1).ravel() / 60
+    current = episode.input[:, episode.input_names.index("current_A")]
+    return {
+        "soc": (np.concatenate([episode.time_s[:1], episode.time_s + step]) / 60, 100 * np.concatenate([start[:1], end])),
+        "current_A": (ends, np.repeat(current, 2)),
+        "voltage_V": (ends, np.stack(episode.signal("voltage_V"), axis=1).ravel()),
+    }
+
+
+def trajectories_figure(view: StudyView) -> Figure:
+    """Four panels over time: SOC, current, voltage, and the voltage near its upper limit. Raises ValueError without a charging problem."""
+    if view.problem is None:
+        raise ValueError(f"study {view.name!r} is not one of battery charging, there are no such trajectories")
+    problem = view.problem
+    with journal_style():
+        from matplotlib.collections import LineCollection
+        from matplotlib.lines import Line2D
+
+        figure, axes = new_figure(PAGE_IN, 4.4, 2, 2, sharex=True)
+        panels = dict(zip(("soc", "current_A", "voltage_V", "near"), axes, strict=True))
+        handles = []
+        grey = [curves(episode) for _, episode in view.episodes(view.others)]
+        for name, axis in panels.items():
+            signal = "voltage_V" if name == "near" else name
+            # Rasterised in vector files, where a hundred trials would be tens of thousands of segments.
+            lines = LineCollection([np.column_stack(c[signal]) for c in grey], colors=GREY, linewidths=0.4, alpha=0.5, rasterized=True)
+            # Snapped to pixels, the steps of a held current would come out dotted.
+            lines.set_snap(False)
+            axis.add_collection(lines)
+        if grey:
+            handles.append(Line2D([], [], color=GREY, linewidth=0.8, label="trials"))
+        shown = []
+        for label, trial, color in (("untuned", view.untuned, BLUE), ("tuned", view.tuned, ORANGE)):
+            episode = view.episode(trial)
+            if trial is None or episode is None:
+                continue
+            drawn = curves(episode)
+            shown.append(drawn["voltage_V"][1])
+            text = f"{label} (trial {trial.number})" if label == "tuned" else label
+            for name, axis in panels.items():
+                signal, width = ("voltage_V", 0.7) if name == "near" else (name, 1.2)
+                axis.plot(*drawn[signal], color=color, linewidth=width, label=text, zorder=3)
+            handles.append(panels["soc"].lines[-1])
+        handles.append(_limits(panels, problem))
+        _frame(figure, panels, problem, shown or [c["voltage_V"][1] for c in grey])
+        letter(axes)
+        legend_above(figure, handles)
+        cell_note(figure, problem.plant_cell.name, problem.plant_cell.remark)
+    return figure
+
+
+def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> object:
+    assert problem.current_max_A is not None and problem.voltage_max_V is not None
+    style = {"color": RED, "linestyle": (0, (4, 2)), "linewidth": 0.9, "label": "limit", "zorder": 4}
+    for name, value in (("current_A", problem.current_max_A), ("voltage_V", problem.voltage_max_V), ("near", problem.voltage_max_V)):
+        line = panels[name].axhline(value, **style)
+    return line
+
+
+def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, voltages: list[NDArray[np.float64]]) -> None:
+    limit = problem.voltage_max_V or 0.0
+    measured = np.concatenate(voltages)
+    peak = np.nanmax(measured, initial=limit)
+    # Wild trials leave this panel: it is there to show the runs before and after tuning.
+    margin = max(0.02, 1.25 * (peak - limit))
+    panels["near"].set_ylim(limit - 0.8 * margin, limit + margin)
+    labels = {"soc": "SOC (%)", "current_A": "current (A)", "voltage_V": "voltage (V)", "near": "voltage near limit (V)"}
+    for name, axis in panels.items():
+        axis.set_ylabel(labels[name])
+        if name != "near":
+            axis.autoscale_view()
+    for axis in list(panels.values())[2:]:
+        axis.set_xlabel("time (min)")
+    figure.align_ylabels()
+    panels["soc"].set_xlim(0.0, problem.steps * problem.sampling_time_s / 60)
+    panels["soc"].set_ylim(0.0, 105.0)
