@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.report.reading import StudyView
-from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, journal_style, legend_above, letter, new_figure
+from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, journal_style, legend_above, letter, new_figure, plain_symlog
 from chargetune.study.trial import Trial, TrialStatus
 
 if TYPE_CHECKING:
@@ -68,19 +68,16 @@ def convergence_figure(view: StudyView) -> Figure:
         lower.set_ylabel(f"worst excess ({label})")
         lower.set_xlabel("trial")
         letter([upper, lower])
-        legend_above(figure, handles, columns=3)
+        legend_above(figure, handles, columns=4 if len(handles) > 6 else 3)
     return figure
 
 
 def _scales(upper: Axes, lower: Axes, losses: list[float]) -> None:
-    from matplotlib.ticker import StrMethodFormatter
-
     positive = np.array(losses)[np.isfinite(losses)]
     # Below a decade a logarithmic axis says no more than a linear one, and its ticks are harder to read.
     if positive.size and np.all(positive > 0) and np.max(positive) > 10 * np.min(positive):
         upper.set_yscale("log")
-    lower.set_yscale("symlog", linthresh=1.0, linscale=0.5)
-    lower.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    plain_symlog(lower)
 
 
 def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.ecm import FLOOR, table_nodes
 from chargetune.report.reading import StudyView
-from chargetune.report.style import BLUE, COLUMN_IN, GREEN, GREY, ORANGE, RED, cell_note, journal_style, legend_above, new_figure
+from chargetune.report.style import BLUE, COLUMN_IN, GREEN, GREY, ORANGE, RED, cell_note, journal_style, legend_above, new_figure, words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,6 +63,9 @@ def backoff_figure(view: StudyView) -> Figure:
             if label in drawn:
                 handles += axis.plot(100 * SOC, drawn[label], color=color, label=label, zorder=3)
                 axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
+        if "tuned" not in drawn:
+            # b = 0 alone spans no range; that of the trials says what was tried.
+            axis.set_ylim(1e3 * problem.backoff.lower_V - 10, 1e3 * problem.backoff.upper_V + 10)
         beside = axis.twinx()
         beside.spines["right"].set_visible(True)
         handles += beside.plot(100 * SOC, PchipInterpolator(cell.ocv_soc, cell.ocv_V)(SOC), color="black", linestyle=":", label="OCV")
@@ -111,6 +114,8 @@ def _grey(axis: Axes, rows: list[NDArray[np.float64]]) -> list[Any]:
 
 def _finish(figure: Figure, axis: Axes, view: StudyView, handles: list[Any]) -> None:
     assert view.problem is not None
+    if view.tuned is None:
+        handles.append(words("tuned: none"))
     spans = [axis.axvspan(100 * low, 100 * high, color=RED, alpha=0.1, linewidth=0) for low, high in violated_soc(view)]
     if spans:
         spans[0].set_label("untuned over limit")

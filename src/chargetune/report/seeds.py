@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.report.style import BLUE, COLUMN_IN, GREY, ORANGE, PAGE_IN, RED, journal_style, legend_above, letter, new_figure, save
+from chargetune.report.style import BLUE, COLUMN_IN, GREY, ORANGE, PAGE_IN, RED, journal_style, legend_above, letter, new_figure, plain_symlog, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["seeds_figure"]
 
-PANELS = (("overshoot_mV", "overshoot (mV)"), ("t95_min", "time to 95 % SOC (min)"))
+PANELS = (("overshoot_mV", "overshoot (mV)"), ("t95_min", "time to 95 %\nSOC (min)"))
 # More seeds than this need the width of a page.
 COLUMN_SEEDS = 12
 
@@ -35,6 +35,7 @@ def seeds_figure(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]
 
         figure, axes = new_figure(COLUMN_IN if len(rows) <= COLUMN_SEEDS else PAGE_IN, 3.6, 2, 1, sharex=True)
         positions = np.arange(len(rows))
+        plain_symlog(axes[0])
         for axis, (key, label) in zip(axes, PANELS, strict=True):
             _panel(axis, rows, key)
             axis.set_ylabel(label)
@@ -45,6 +46,8 @@ def seeds_figure(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]
             Line2D([], [], color="0.3", linewidth=0.9, linestyle=":", label="median"),
             Line2D([], [], color=RED, linestyle=(0, (4, 2)), linewidth=0.9, label="limit"),
         ]
+        if any(label.endswith("no value") for axis in axes for label in axis.get_legend_handles_labels()[1]):
+            handles.append(Line2D([], [], linestyle="none", marker="x", color="0.3", markersize=4, label="no value"))
         known = [row.get("attainable_t95_min") for row in rows]
         if any(v is not None for v in known):
             axes[1].plot(positions, _numbers(known), "_", color="black", markersize=8, label="attainable")
@@ -61,15 +64,17 @@ def seeds_figure(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]
 def _panel(axis: Axes, rows: Sequence[Mapping[str, Any]], key: str) -> None:
     positions = np.arange(len(rows))
     values = {name: _numbers([(row[name] or {}).get(key) for row in rows]) for name in ("untuned", "tuned")}
-    axis.vlines(positions, values["untuned"], values["tuned"], color=GREY, linewidth=0.8, zorder=1)
-    for name, color, marker in (("untuned", BLUE, "o"), ("tuned", ORANGE, "D")):
+    both = np.isfinite(values["untuned"]) & np.isfinite(values["tuned"])
+    axis.vlines(positions[both], values["untuned"][both], values["tuned"][both], color=GREY, linewidth=0.8, zorder=1)
+    for name, color, marker, aside in (("untuned", BLUE, "o", -0.15), ("tuned", ORANGE, "D", 0.15)):
         axis.plot(positions, values[name], marker, color=color, markersize=4, label=name, zorder=3)
         median = _median(rows, name, key, values[name])
         if np.isfinite(median):
             axis.axhline(median, color=color, linewidth=0.9, linestyle=":", label=f"median {name}", zorder=2)
-    without = positions[np.isnan(values["tuned"])]
-    if without.size:
-        axis.plot(without, [0.96] * without.size, "x", color=ORANGE, markersize=4, transform=axis.get_xaxis_transform(), label="tuned: none")
+        without = positions[np.isnan(values[name])]
+        if without.size:
+            at = axis.get_xaxis_transform()
+            axis.plot(without + aside, [0.97] * without.size, "x", color=color, markersize=4, transform=at, label=f"{name}: no value", clip_on=False)
 
 
 def _numbers(values: Sequence[float | None]) -> NDArray[np.float64]:

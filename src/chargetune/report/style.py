@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 __all__ = [
     "BLUE", "COLUMN_IN", "FORMATS", "GREEN", "GREY", "ORANGE", "PAGE_IN", "RED",
-    "cell_note", "journal_style", "legend_above", "letter", "new_figure", "save",
+    "cell_note", "journal_style", "legend_above", "letter", "new_figure", "plain_symlog", "save", "words",
 ]  # fmt: skip
 
 # Okabe and Ito's palette, told apart with every kind of colour vision; the red is darker, to differ from the orange in lightness too.
@@ -83,9 +84,24 @@ def letter(axes: Sequence[Axes]) -> None:
         axis.set_title(f"({name})", loc="left", pad=3)
 
 
+def plain_symlog(axis: Axes) -> None:
+    """A y axis for an excess: linear within 1 on either side of the limit, logarithmic beyond, with plain numbers at its ticks."""
+    from matplotlib.ticker import StrMethodFormatter
+
+    axis.set_yscale("symlog", linthresh=1.0, linscale=0.5)
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+
+
+def words(text: str) -> Line2D:
+    """An entry of a legend that is only text."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], linestyle="none", label=text)
+
+
 def legend_above(figure: Figure, handles: Sequence[Any], columns: int | None = None) -> None:
     """One legend for all axes, above them."""
-    figure.legend(handles=list(handles), loc="outside upper center", ncols=columns or len(handles), columnspacing=1.2)
+    figure.legend(handles=list(handles), loc="outside upper center", ncols=columns or len(handles), columnspacing=1.1)
 
 
 def cell_note(figure: Figure, name: str, remark: str) -> None:

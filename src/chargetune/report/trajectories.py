@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from chargetune.battery.charging import ChargingProblem
 from chargetune.episode.episode import Episode
 from chargetune.report.reading import StudyView
-from chargetune.report.style import BLUE, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, legend_above, letter, new_figure
+from chargetune.report.style import BLUE, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, legend_above, letter, new_figure, words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,6 +71,8 @@ def trajectories_figure(view: StudyView) -> Figure:
                 signal, width = ("voltage_V", 0.7) if name == "near" else (name, 1.2)
                 axis.plot(*drawn[signal], color=color, linewidth=width, label=text, zorder=3)
             handles.append(panels["soc"].lines[-1])
+        if view.tuned is None:
+            handles.append(words("tuned: none"))
         handles.append(_limits(panels, problem))
         _frame(figure, panels, problem, shown or [c["voltage_V"][1] for c in grey])
         letter(axes)

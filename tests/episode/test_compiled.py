@@ -1,0 +1,255 @@
+"""The whole episode as one function: the same as step by step, compiled or not, cached by content."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chargetune.control.compiler import find_compiler
+from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.episode.compiled import compiled_episode, simulate
+from chargetune.episode.episode import BLIND_MAX, Ending, Trip
+from chargetune.episode.stepwise import run_episode
+from chargetune.model.model import Model
+from chargetune.plants.sensors import Sensors
+from chargetune.plants.simulated import SimulatedPlant
+
+NOISY = Sensors({"voltage_V": 2e-3, "soc": 1e-3}, {"voltage_V": 5e-3}, {"voltage_V": 1e-3, "soc": 1e-4})
+KALMAN = ExtendedKalman(("voltage_V", "soc"), (5e-3, 1e-3), (1e-4, 1e-3), (1e-2, 1e-2))
+SOC = Propagated(("soc",))
+
+# What changes the loop: estimator, sensors, process noise.
+LOOPS = {
+    "ideal": (SOC, Sensors(), {}),
+    "noise": (SOC, Sensors(noise_sd={"voltage_V": 2e-3, "soc": 1e-3}), {}),
+    "bias": (SOC, Sensors(bias={"soc": 0.02}), {}),
+    "quantised": (SOC, Sensors(resolution={"soc": 0.01, "voltage_V": 5e-3}), {}),
+    "all of these": (SOC, NOISY, {}),
+    "delay 1": (SOC, Sensors(delay_steps=1), {}),
+    "delay 3, noise": (SOC, replace(NOISY, delay_steps=3), {}),
+    "process noise": (SOC, Sensors(), {"soc": 1e-3, "overpotential_V": 2e-3}),
+    "exact state": (ExactState(), Sensors(), {}),
+    "exact state, delay 3": (ExactState(), Sensors({"overpotential_V": 1e-3}, delay_steps=3), {}),
+    "open loop": (Propagated(()), Sensors(), {}),
+    "Kalman filter": (KALMAN, NOISY, {"soc": 1e-4}),
+    "Kalman filter, delay 1": (KALMAN, replace(NOISY, delay_steps=1), {}),
+}
+THETA = (0.05, -0.02, 0.1, 0.03, 0.0, 0.02, 0.01)
+
+
+def loop(charging, name):
+    estimator, sensors, process = LOOPS[name]
+    controller = replace(charging.controller, estimator=estimator)
+    return controller, replace(charging.plant, sensors=sensors, process_noise_sd=process)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_virtual_machine_and_step_by_step(charging, same, name):
+    controller, plant = loop(charging, name)
+    whole = simulate(controller, plant, steps=120, theta=THETA, seed=4, compiled=False)
+    same(whole, run_episode(controller, plant, steps=120, theta=THETA, seed=4))
+    assert (whole.ending, len(whole), whole.failures) == (Ending.DONE, 120, 0)
+
+
+@pytest.mark.parametrize("name", ["all of these", "exact state", "Kalman filter, delay 1"])
+def test_compiled_and_step_by_step(charging, same, name):
+    controller, plant = loop(charging, name)
+    episodes = compiled_episode(controller, plant, 120, compiled=True)
+    assert episodes.compiled
+    same(episodes.run(THETA, 4), run_episode(controller, plant, steps=120, theta=THETA, seed=4))
+
+
+def test_what_the_loops_have_in_common_is_not_all(charging):
+    # Else the table above would compare a loop with itself.
+    inputs = [simulate(*loop(charging, name), steps=120, theta=THETA, seed=4, compiled=False).input for name in LOOPS]
+    for i, one in enumerate(inputs):
+        for other in inputs[:i]:
+            assert np.max(np.abs(one - other)) > 1e-4
+
+
+def test_more_steps_than_noise_is_drawn_at_first(tank_controller, tank_plant, same):
+    plant = tank_plant(sensors=Sensors(noise_sd={"level": 0.05, "gauge": 0.02}), process_noise_sd={"level": 0.05})
+    controller = tank_controller()
+    whole = simulate(controller, plant, steps=1100, seed=2, compiled=False)
+    same(whole, run_episode(controller, plant, steps=1100, seed=2))
+    assert np.std(whole.output_end[512:, 0] - whole.arrays()["true_end"][512:, 0]) == pytest.approx(0.05, rel=0.15)
+    shorter = simulate(controller, plant, steps=40, seed=2, compiled=False)
+    np.testing.assert_array_equal(shorter.input, whole.input[:40])
+
+
+def test_seeds(tank_controller, tank_plant):
+    plant, controller = tank_plant(sensors=Sensors(noise_sd={"level": 0.05})), tank_controller()
+    one, again, other = (simulate(controller, plant, steps=40, seed=s, compiled=False) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one.input, again.input)
+    assert not np.array_equal(one.input, other.input)
+
+
+def test_parameters_and_start_are_run_time_values(tank_controller, tank_plant, tank, same):
+    controller = tank_controller()
+    for plant in (tank_plant(), SimulatedPlant(tank.with_parameters(leak=0.8, splash=0.1), {"level": 0.5})):
+        episodes = compiled_episode(controller, plant, 40, compiled=False)
+        same(episodes.run(), run_episode(controller, plant, steps=40))
+        first = compiled_episode(controller, tank_plant(), 40, compiled=False)
+        assert episodes.function is first.function
+
+
+TRIPS = {
+    "at rest": ((Trip("gauge", upper=0.9),), {}),
+    "at rest, noisy": ((Trip("level", lower=0.99),), {"sensors": Sensors(noise_sd={"level": 0.2})}),
+    "start of an interval": ((Trip("gauge", upper=1.6),), {}),
+    "lower side": ((Trip("level", lower=1.2),), {"process_noise_sd": {"level": 0.3}}),
+    "two": ((Trip("level", upper=1.79), Trip("gauge", upper=1.85)), {}),
+    "never": ((Trip("gauge", -5.0, 50.0),), {}),
+}
+
+
+@pytest.mark.parametrize("name", TRIPS)
+def test_trips_cut_at_the_same_interval(tank_controller, tank_plant, same, name):
+    trips, more = TRIPS[name]
+    controller, plant = tank_controller(), tank_plant(**more)
+    for seed in range(5):
+        whole = simulate(controller, plant, steps=40, seed=seed, trips=trips, compiled=False)
+        same(whole, run_episode(controller, plant, steps=40, seed=seed, trips=trips))
+        if name == "never":
+            assert (whole.ending, len(whole)) == (Ending.DONE, 40)
+        elif not more:
+            assert whole.ending is Ending.LIMIT
+            assert (len(whole) == 0) == (name == "at rest")
+
+
+def test_a_solver_without_a_number_ends_both_ways(tank_controller, tank_plant, same):
+    import casadi as ca
+
+    controller = tank_controller(cost=lambda s: ca.sqrt(s.theta["limit"]) * (s.x["level"] - s.x_d["level"]) ** 2)
+    whole = simulate(controller, tank_plant(), steps=40, theta=[-1.0], compiled=False)
+    same(whole, run_episode(controller, tank_plant(), steps=40, theta=[-1.0]))
+    assert (whole.ending, len(whole)) == (Ending.SOLVER, BLIND_MAX)
+
+
+def odd(tank, level, gauge):
+    """A tank of which the next level and the gauge are given expressions of level and inflow."""
+    return Model.build(
+        "odd", states=tank.states, inputs=tank.inputs, outputs=tank.outputs, parameters={}, sampling_time_s=2.0,
+        equations=lambda x, u, p: ({"level": level(x["level"], u["inflow"])}, {"level": x["level"], "gauge": gauge(x["level"])}),
+    )  # fmt: skip
+
+
+def test_a_gauge_without_a_number_ends_both_ways(tank_controller, tank, same):
+    import casadi as ca
+
+    # The root is no number above level 1.5.
+    plant = SimulatedPlant(odd(tank, lambda x, u: 0.9 * x + u, lambda x: ca.sqrt(1.5 - x)), {"level": 1.0})
+    whole = simulate(tank_controller(), plant, steps=40, compiled=False)
+    same(whole, run_episode(tank_controller(), plant, steps=40))
+    assert whole.ending is Ending.SENSOR
+    assert len(whole) < 10
+
+
+@pytest.mark.parametrize("trips", [(), (Trip("level", upper=1e20),)])
+def test_a_state_that_is_not_finite_ends_both_ways(tank_controller, tank, same, trips):
+    plant = SimulatedPlant(odd(tank, lambda x, u: 1e100 * x + u, lambda x: x), {"level": 1.0})
+    whole = simulate(tank_controller(), plant, steps=40, trips=trips, compiled=False)
+    same(whole, run_episode(tank_controller(), plant, steps=40, trips=trips))
+    assert (whole.ending, len(whole)) == ((Ending.LIMIT, 1) if trips else (Ending.PLANT, 3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "steps = 0, allowed is an integer >= 1"),
+        ({"steps": 2.5}, "steps = 2.5, allowed is an integer >= 1"),
+        ({"seed": -1}, "seed = -1, allowed is an integer >= 0"),
+        ({"theta": [9.0]}, r"theta: limit = 9, allowed is \[-1, 5\]"),
+        ({"trips": [Trip("voltage", upper=1.0)]}, r"trip of unknown \['voltage'\], allowed are level, gauge"),
+    ],
+)
+def test_refuses_what_step_by_step_refuses(tank_controller, tank_plant, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        simulate(tank_controller(), tank_plant(), **({"steps": 40, "compiled": False} | arguments))
+
+
+# A fresh process: prints whether it is compiled, and the last input to the last bit.
+PROGRAM = """
+import sys
+from chargetune.battery.cell import default_cell
+from chargetune.battery.charging import ChargingProblem
+problem = ChargingProblem(default_cell(), mismatch_seed=0, steps=8, horizon=2)
+print(problem._episodes.compiled, problem.episode().input[-1, 0].hex())
+"""
+
+
+def fresh(**environment):
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("CHARGETUNE")}
+    done = subprocess.run(
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM], env=kept | environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_a_fresh_process_loads_what_was_compiled_before(tmp_path):
+    log, wrapper, cache = tmp_path / "calls", tmp_path / "counting-cc", tmp_path / "cache"
+    wrapper.write_text(f'#!/bin/sh\necho called >> "{log}"\nexec "{find_compiler()}" "$@"\n')
+    wrapper.chmod(0o755)
+    environment = {"CHARGETUNE_CC": str(wrapper), "CHARGETUNE_CACHE": str(cache)}
+    first = fresh(**environment)
+    calls, libraries = log.read_text(), sorted(cache.iterdir())
+    assert first[0] == "True"
+    assert calls
+    assert len(libraries) == len(calls.splitlines())
+    assert fresh(**environment) == first
+    assert log.read_text() == calls
+    assert sorted(cache.iterdir()) == libraries
+
+
+def test_no_compiler_means_the_virtual_machine(tmp_path):
+    compiled, current = fresh(CHARGETUNE_CC="none", CHARGETUNE_CACHE=str(tmp_path))
+    assert compiled == "False"
+    assert 0.0 <= float.fromhex(current) <= 6.0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def broken_compiler(monkeypatch, tmp_path):
+    monkeypatch.setenv("CHARGETUNE_CC", "false")
+    monkeypatch.setenv("CHARGETUNE_CACHE", str(tmp_path))
+
+
+@pytest.mark.usefixtures("broken_compiler")
+def test_a_broken_compiler_is_named_and_the_virtual_machine_stands_in(tank_controller, tank_plant, same):
+    controller, plant = tank_controller(), tank_plant()
+    with pytest.warns(RuntimeWarning, match=r"virtual machine.*: the C compiler failed: .*/false") as told:
+        episodes = compiled_episode(controller, plant, 17)
+    assert not episodes.compiled
+    assert Path(told[0].filename).name == "test_compiled.py"
+    same(episodes.run(), run_episode(controller, plant, steps=17))
+    # It is tried once a content, not once an episode.
+    assert compiled_episode(controller, plant, 17).function is episodes.function
+
+
+@pytest.mark.usefixtures("broken_compiler")
+def test_a_broken_compiler_is_an_error_when_compiling_is_insisted_on(tank_controller, tank_plant):
+    with pytest.raises(RuntimeError, match="the C compiler failed"):
+        compiled_episode(tank_controller(), tank_plant(), 18, compiled=True)
+    assert not compiled_episode(tank_controller(), tank_plant(), 18, compiled=False).compiled
+
+
+def test_insisting_without_a_compiler(tank_controller, tank_plant, monkeypatch):
+    monkeypatch.setenv("CHARGETUNE_CC", "none")
+    assert not compiled_episode(tank_controller(), tank_plant(), 19).compiled
+    with pytest.raises(RuntimeError, match="no C compiler found; set CHARGETUNE_CC"):
+        compiled_episode(tank_controller(), tank_plant(), 19, compiled=True)
+
+
+def test_a_cache_that_cannot_be_written(tank_controller, tank_plant, monkeypatch, tmp_path):
+    blocked = tmp_path / "a file"
+    blocked.write_text("")
+    monkeypatch.setenv("CHARGETUNE_CACHE", str(blocked))
+    with pytest.warns(RuntimeWarning, match=r"virtual machine.*a file"):
+        assert not compiled_episode(tank_controller(), tank_plant(), 20).compiled
+    with pytest.raises(OSError, match="a file"):
+        compiled_episode(tank_controller(), tank_plant(), 20, compiled=True)
