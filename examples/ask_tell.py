@@ -16,7 +16,10 @@ def main(trials, path):
     config = case_study("backoff", mismatch_seed=1)
     problem = config.problem()
     tuner = ConstrainedLogEI(seed=0)
-    with Store(path) as store, Study.create_or_resume(store, "my cell", config=config.document(), space=problem.space, tuner=tuner) as study:
+    with (
+        Store(path) as store,
+        Study.create_or_resume(store, "my cell", config=config.document(), space=problem.space, tuner=tuner) as study,
+    ):
         while True:
             # A charge that was cut off last time comes first, then the tuner's next proposal.
             waiting = study.running() or study.ask_batch(trials)
@@ -30,7 +33,8 @@ def main(trials, path):
                     study.fail(trial.number, str(error))
                     continue
                 study.tell(trial.number, score, episode)
-                print(f"trial {trial.number}: overshoot {score.metrics['overshoot_mV']:6.1f} mV, t80 {score.metrics['t80_min'] or float('nan'):.1f} min")
+                m = score.metrics
+                print(f"trial {trial.number}: overshoot {m['overshoot_mV']:6.1f} mV, t80 {m['t80_min'] or float('nan'):.1f} min")
         best = study.best()
     print("no trial kept the limits" if best is None else f"best: trial {best.number}, theta = {[round(v, 4) for v in best.theta]}")
 

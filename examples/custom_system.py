@@ -1,7 +1,7 @@
 """Tune an MPC for a system that is no battery: an overhead crane moves its load 2 m without letting it swing too far.
 
-The controller believes in a rope of 0.6 m, the crane has 1.0 m, so the load swings beyond its limit. theta has one entry in the cost (weight of the swing) and
-one in the model (rope length). Run: python examples/custom_system.py [TRIALS]
+The controller believes in a rope of 0.6 m, the crane has 1.0 m, so the load swings beyond its limit. theta has one entry in
+the cost (weight of the swing) and one in the model (rope length). Run: python examples/custom_system.py [TRIALS]
 """
 
 import sys
@@ -89,7 +89,7 @@ def main(trials):
     with tempfile.TemporaryDirectory() as folder, Store(Path(folder) / "crane.sqlite") as store:
         setup = {"system": "crane", "steps": STEPS, "swing_max_rad": SWING_MAX_RAD}
         with Study.create_or_resume(store, "crane", config=setup, space=SPACE, tuner=ConstrainedLogEI(seed=0)) as study:
-            best = study.run(evaluate, trials, progress=lambda trial, *_: print(".", end="", flush=True))
+            best = study.run(evaluate, trials, progress=lambda *_: print(".", end="", flush=True))
             untuned = study.trials()[0]
     print()
     for name, trial in (("untuned", untuned), ("tuned", best)):

@@ -1,7 +1,6 @@
 """The commands as a user runs them."""
 
 import json
-import os
 import re
 import sqlite3
 import subprocess
@@ -12,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chargetune.cli import main
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 
@@ -20,6 +21,20 @@ def chargetune(*arguments, cwd=None, code=0):
     done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, cwd=cwd, check=False)
     assert done.returncode == code, done.stdout + done.stderr
     return done
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys):
+    """Run the command in this process, which is quicker than a new one; it must refuse with exit code 2 and one message."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        return capsys.readouterr().err
+
+    return run
 
 
 def write(folder, text, name="study.toml"):
@@ -93,10 +108,9 @@ def test_simulate_takes_theta_by_name_and_by_position(tmp_path):
         ("{", ["--theta", "JSON"]),
     ],
 )
-def test_a_bad_theta_is_refused(theta, words, tmp_path):
-    done = chargetune("simulate", write(tmp_path, QUICK), "--theta", theta, code=2)
-    assert all(word in done.stderr for word in words), done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_bad_theta_is_refused(theta, words, tmp_path, refused):
+    message = refused("simulate", write(tmp_path, QUICK), "--theta", theta)
+    assert all(word in message for word in words), message
 
 
 @pytest.mark.parametrize(
@@ -125,11 +139,9 @@ def test_a_bad_theta_is_refused(theta, words, tmp_path):
         (("[study]", "[study"), ["not valid TOML"]),
     ],
 )
-def test_a_bad_config_is_refused_before_anything_runs(change, words, tmp_path):
-    path = write(tmp_path, QUICK.replace(*change))
-    done = chargetune("tune", path, "--store", tmp_path / "s.sqlite", code=2)
-    assert all(word in done.stderr for word in words), done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_bad_config_is_refused_before_anything_runs(change, words, tmp_path, refused):
+    message = refused("tune", write(tmp_path, QUICK.replace(*change)), "--store", tmp_path / "s.sqlite")
+    assert all(word in message for word in words), message
     assert not (tmp_path / "s.sqlite").exists()
 
 
@@ -151,7 +163,7 @@ def test_tune_resumes_shows_and_draws(tmp_path):
     assert first["trials"] == 4
     done = chargetune("tune", path, "--out", tmp_path / "out")
     assert "6 trials" in done.stdout
-    assert "resumed at trial 4" in done.stderr
+    assert "resumed: 4 trials" in done.stderr
     again = json.loads(chargetune("tune", path, "--out", tmp_path / "out", "--json").stdout)
     whole = json.loads(chargetune("tune", path, "--store", tmp_path / "whole.sqlite", "--json").stdout)
     assert again == whole
@@ -209,12 +221,13 @@ def test_reproduce_writes_claims_rows_and_figures(tmp_path):
 
 
 @pytest.mark.parametrize("seeds", ["3:3", "a:b", "-1:2", "1,1"])
-def test_bad_seeds_are_refused(seeds, tmp_path):
-    assert "--seeds" in chargetune("reproduce", "model", f"--seeds={seeds}", "--out", tmp_path / "o", code=2).stderr
+def test_bad_seeds_are_refused(seeds, tmp_path, refused):
+    assert "--seeds" in refused("reproduce", "model", f"--seeds={seeds}", "--out", tmp_path / "o")
 
 
 def test_help_is_light():
-    code = "import sys; import chargetune.cli; print(sorted({m.split('.')[0] for m in sys.modules} & {'casadi', 'torch', 'numpy', 'matplotlib', 'pydantic'}))"
+    heavy = "{'casadi', 'torch', 'numpy', 'matplotlib', 'pydantic'}"
+    code = f"import sys; import chargetune.cli; print(sorted({{m.split('.')[0] for m in sys.modules}} & {heavy}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
     for command in ((), ("tune",), ("simulate",), ("show",), ("reproduce",)):
@@ -226,4 +239,4 @@ def test_a_store_survives_being_read_while_written(tmp_path):
     chargetune("tune", path, "--store", store)
     with sqlite3.connect(store) as connection:
         assert connection.execute("pragma integrity_check").fetchone() == ("ok",)
-    assert os.path.getsize(store) > 0
+    assert store.stat().st_size > 0

@@ -110,6 +110,8 @@ def column(*values):
 FINE = column(1, 1, 1, 1, 1, 1)
 NAN = math.nan
 FALLBACK = int(SolveStatus.FALLBACK)
+BLIND = "no finite measurement in 3 intervals in a row"
+BROKEN = "the solver gave no finite input in 3 intervals in a row"
 
 ENDINGS = {
     "nothing": ({}, Ending.DONE, STEPS, ""),
@@ -119,13 +121,11 @@ ENDINGS = {
     "on the limit": ({"output_end": column(2, 2, 0, 2, 2, 2)}, Ending.DONE, STEPS, ""),
     "infinite": ({"output_end": column(1, math.inf, 1, 1, 1, 1)}, Ending.LIMIT, 2, "gauge = inf left [0, 2]"),
     "blind twice, twice": ({"output_end": column(NAN, NAN, 1, NAN, NAN, 1)}, Ending.DONE, STEPS, ""),
-    "blind three times": ({"output_end": column(1, NAN, NAN, NAN, 1, 1)}, Ending.SENSOR, 4, "no finite measurement in 3 intervals in a row"),
-    "blind, over later": ({"output_end": column(NAN, NAN, NAN, 1, 9, 1)}, Ending.SENSOR, 3, "no finite measurement in 3 intervals in a row"),
+    "blind three times": ({"output_end": column(1, NAN, NAN, NAN, 1, 1)}, Ending.SENSOR, 4, BLIND),
+    "blind, over later": ({"output_end": column(NAN, NAN, NAN, 1, 9, 1)}, Ending.SENSOR, 3, BLIND),
     "over, blind later": ({"output_end": column(9, 1, NAN, NAN, NAN, 1)}, Ending.LIMIT, 1, "gauge = 9 left [0, 2]"),
     "broken twice": ({"status": np.array([0, FALLBACK, FALLBACK, 0, FALLBACK, FALLBACK])}, Ending.DONE, STEPS, ""),
-    "broken three times": (
-        {"status": np.array([0, 0, FALLBACK, FALLBACK, FALLBACK, 0])}, Ending.SOLVER, 5, "the solver gave no finite input in 3 intervals in a row",
-    ),
+    "broken three times": ({"status": np.array([0, 0, FALLBACK, FALLBACK, FALLBACK, 0])}, Ending.SOLVER, 5, BROKEN),
     "not converged is not broken": ({"status": np.full(STEPS, int(SolveStatus.NOT_CONVERGED))}, Ending.DONE, STEPS, ""),
 }  # fmt: skip
 

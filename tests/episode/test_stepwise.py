@@ -172,7 +172,7 @@ def test_a_solver_that_gives_no_number_stops_on_the_declared_fallback(tank_contr
 def test_a_state_that_is_not_finite_ends_with_the_plant(tank_controller, tank):
     burst = Model.build(
         "burst", states=tank.states, inputs=tank.inputs, outputs=tank.outputs, parameters={"growth": 1e100}, sampling_time_s=2.0,
-        equations=lambda x, u, p: ({"level": p["growth"] * x["level"]}, {"level": x["level"], "gauge": x["level"]}),
+        equations=lambda x, _u, p: ({"level": p["growth"] * x["level"]}, {"level": x["level"], "gauge": x["level"]}),
     )  # fmt: skip
     episode = run_episode(tank_controller(), SimulatedPlant(burst, {"level": 1.0}), steps=20)
     assert (episode.ending, len(episode)) == (Ending.PLANT, 3)
@@ -226,7 +226,7 @@ def other(tank, **changed):
     return SimulatedPlant(
         Model.build(
             "other", parameters={}, **values,
-            equations=lambda x, u, p: (
+            equations=lambda x, u, _p: (
                 {"level": x["level"] + u[inflow]},
                 {s.name: x["level"] for s in values["outputs"]},
             ),

@@ -23,8 +23,8 @@ def table(measurements, name):
 
 # What the faulty `end` and `start` of intervals 2..3 are, from the sound ones; row k + 1 of the tables is interval k.
 EXPECTED = {
-    FaultKind.MISSING: lambda start, end: ([[math.nan] * 2] * 2, [[math.nan] * 2] * 2),
-    FaultKind.STUCK: lambda start, end: ([end[2], end[2]], [end[2], end[2]]),
+    FaultKind.MISSING: lambda _start, _end: ([[math.nan] * 2] * 2, [[math.nan] * 2] * 2),
+    FaultKind.STUCK: lambda _start, end: ([end[2], end[2]], [end[2], end[2]]),
     FaultKind.SPIKE: lambda start, end: ([start[3], start[4]], [end[3] + 0.7, end[4]]),
     FaultKind.BIAS: lambda start, end: ([start[3] + 0.7, start[4] + 0.7], [end[3] + 0.7, end[4] + 0.7]),
     FaultKind.REVERSED: lambda start, end: ([-start[3], -start[4]], [-end[3], -end[4]]),

@@ -29,7 +29,7 @@ MID_SOC = 0.5
 
 @dataclass(frozen=True)
 class SeedRun:
-    """One seed of one case study: its problem, the untuned trial, the tuned one (None: no trial qualified), their episodes."""
+    """One seed of one case study: its problem, the untuned trial and the tuned one (None: no trial has a score), their episodes."""
 
     problem: ChargingProblem
     trials: tuple[Trial, ...]
@@ -137,33 +137,47 @@ def _exceeds_where_violating(runs: Runs) -> bool:
     return bool(np.mean(natural_spline_values(nodes, learned, where)) > np.mean(natural_spline_values(nodes, full, where)))
 
 
+def _faster(slow: SeedRun, fast: SeedRun, mark: str) -> bool:
+    return fast.minutes(mark, tuned=True) < slow.minutes(mark, tuned=True)
+
+
+def _slower_than_untuned(runs: Runs) -> bool:
+    run = runs["backoff"]
+    return run.tuned is not None and run.minutes("t80_min", tuned=True) > run.minutes("t80_min", tuned=False)
+
+
+def _little_different(runs: Runs) -> bool:
+    run = runs["model"]
+    untuned = run.minutes("t95_min", tuned=False)
+    return bool(np.isfinite(untuned)) and abs(run.minutes("t95_min", tuned=True) - untuned) <= SLIGHTLY * untuned
+
+
+def _later_switch(runs: Runs) -> bool:
+    run = runs["model"]
+    return run.tuned is not None and run.minutes("switch_min", tuned=True) > run.minutes("switch_min", tuned=False)
+
+
+def _same_start(runs: Runs) -> bool:
+    return bool(np.array_equal(runs["backoff"].untuned_episode.input, runs["model"].untuned_episode.input))
+
+
+ONE, TWO, BOTH = ("backoff",), ("model",), ("backoff", "model")
 CLAIMS = (
-    Claim(1, "the untuned run violates the voltage limit (more than 1 mV)", (), lambda r: _overshoot(next(iter(r.values())).untuned) > OVERSHOOT_MV),
-    Claim(2, "the tuned run of study 1 (backoff) does not (at most 1 mV)", ("backoff",), lambda r: _safe(r["backoff"])),
-    Claim(3, "the learned backoff falls with SOC from mid SOC to 1 (least-squares slope)", ("backoff",), _backoff_falls),
     Claim(
-        4, "SOC rises more slowly in the tuned run of study 1 than untuned (t80)", ("backoff",),
-        lambda r: r["backoff"].tuned is not None and r["backoff"].minutes("t80_min", tuned=True) > r["backoff"].minutes("t80_min", tuned=False),
+        1,
+        "the untuned run violates the voltage limit (more than 1 mV)",
+        (),
+        lambda r: _overshoot(next(iter(r.values())).untuned) > OVERSHOOT_MV,
     ),
-    Claim(
-        5, "both studies begin with the same run", ("backoff", "model"),
-        lambda r: np.array_equal(r["backoff"].untuned_episode.input, r["model"].untuned_episode.input),
-    ),
-    Claim(6, "the tuned run of study 2 (model) does not violate (at most 1 mV)", ("model",), lambda r: _safe(r["model"])),
-    Claim(
-        7, "study 2 is faster than study 1 (t95)", ("backoff", "model"),
-        lambda r: r["model"].minutes("t95_min", tuned=True) < r["backoff"].minutes("t95_min", tuned=True),
-    ),
-    Claim(
-        8, "the charging time of study 2 differs little from the unsafe untuned run (t95, at most 10 %)", ("model",),
-        lambda r: abs(r["model"].minutes("t95_min", tuned=True) - r["model"].minutes("t95_min", tuned=False))
-        <= SLIGHTLY * r["model"].minutes("t95_min", tuned=False),
-    ),
-    Claim(
-        9, "the switch from constant current is later in study 2 than untuned", ("model",),
-        lambda r: r["model"].tuned is not None and r["model"].minutes("switch_min", tuned=True) > r["model"].minutes("switch_min", tuned=False),
-    ),
-    Claim(10, "more trials violate in study 2 than in study 1", ("backoff", "model"), lambda r: r["model"].violating > r["backoff"].violating),
-    Claim(11, "the learned R1 differs from the true one (more than 5 % at a node)", ("model",), _differs_from_true),
-    Claim(12, "the learned R1 exceeds the untuned R1 where the untuned run violates (mean over that SOC)", ("model",), _exceeds_where_violating),
-)  # fmt: skip
+    Claim(2, "the tuned run of study 1 (backoff) does not (at most 1 mV)", ONE, lambda r: _safe(r["backoff"])),
+    Claim(3, "the learned backoff falls with SOC from mid SOC to 1 (least-squares slope)", ONE, _backoff_falls),
+    Claim(4, "SOC rises more slowly in the tuned run of study 1 than untuned (t80)", ONE, _slower_than_untuned),
+    Claim(5, "both studies begin with the same run", BOTH, _same_start),
+    Claim(6, "the tuned run of study 2 (model) does not violate (at most 1 mV)", TWO, lambda r: _safe(r["model"])),
+    Claim(7, "study 2 is faster than study 1 (t95)", BOTH, lambda r: _faster(r["backoff"], r["model"], "t95_min")),
+    Claim(8, "the charging time of study 2 differs little from the unsafe untuned run (t95, at most 10 %)", TWO, _little_different),
+    Claim(9, "the switch from constant current is later in study 2 than untuned", TWO, _later_switch),
+    Claim(10, "more trials violate in study 2 than in study 1", BOTH, lambda r: r["model"].violating > r["backoff"].violating),
+    Claim(11, "the learned R1 differs from the true one (more than 5 % at a node)", TWO, _differs_from_true),
+    Claim(12, "the learned R1 exceeds the untuned R1 where the untuned run violates (mean over that SOC)", TWO, _exceeds_where_violating),
+)

@@ -126,9 +126,8 @@ class Config(_Table):
     def problem(self, folder: Path | None = None) -> ChargingProblem:
         """The charging problem; a relative cell file is looked for in ``folder``. Raises ValueError, FileNotFoundError."""
         theta = self.theta
-        ratios = tuple(
-            ResistanceRatio(name, table.lower, table.upper) for name, table in (("R0", theta.R0), ("R1", theta.R1)) if table is not None
-        )
+        ratios = [ResistanceRatio("R0", theta.R0.lower, theta.R0.upper)] if theta.R0 else []
+        ratios += [ResistanceRatio("R1", theta.R1.lower, theta.R1.upper)] if theta.R1 else []
         sensors = Sensors(
             noise_sd={"voltage_V": self.sensors.voltage_noise_sd_V, "soc": self.sensors.soc_noise_sd},
             bias={"voltage_V": self.sensors.voltage_bias_V, "soc": self.sensors.soc_bias},
@@ -138,7 +137,7 @@ class Config(_Table):
         return ChargingProblem(
             plant_cell=self._cell(folder),
             backoff=Backoff(**theta.backoff.model_dump()) if theta.backoff else None,
-            ratios=ratios,
+            ratios=tuple(ratios),
             sensors=sensors,
             **self.objective.model_dump(),
             **self.controller.model_dump(),
@@ -148,7 +147,7 @@ class Config(_Table):
 
     def values(self, problem: ChargingProblem) -> NDArray[np.float64]:
         """theta as the file gives it; what it does not name is untuned."""
-        return problem.space.from_dict({name: value for name, value in self.theta.values.items()})
+        return problem.space.from_dict(dict(self.theta.values))
 
     def document(self, folder: Path | None = None) -> dict[str, Any]:
         """What decides the trials, as JSON data for the store: the cell's numbers instead of its file, without the number of trials."""
@@ -167,7 +166,7 @@ class Config(_Table):
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
-    cell = {name: tuple(value) if isinstance(value, list) else value for name, value in document["cell"].items()}
+    cell: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in document["cell"].items()}
     tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
     return replace(Config.model_validate(tables).problem(), plant_cell=Cell(**cell))
 

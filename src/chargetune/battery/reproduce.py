@@ -31,7 +31,7 @@ ATTAINABLE_T95_MIN: dict[str, tuple[float, ...]] = {
 def make_tuner(name: TunerName, seed: int) -> Proposer:
     """The tuner that a configuration names."""
     # torch is needed from here on only.
-    from chargetune import learning  # noqa: PLC0415
+    from chargetune import learning
 
     makers: dict[str, Callable[[int], Proposer]] = {
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
@@ -67,7 +67,8 @@ def tuned_trial(trials: Sequence[Trial], tuner: str) -> Trial | None:
 
 
 def _worst_excess(trial: Trial) -> float:
-    assert trial.score is not None
+    if trial.score is None:
+        return np.inf
     return max((e - trial.score.tolerance.get(name, 0.0) for name, e in trial.score.excess.items()), default=0.0)
 
 

@@ -55,7 +55,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
-    from chargetune.cli.tune import tune_command  # noqa: PLC0415
+    from chargetune.cli.tune import tune_command
 
     tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, as_json=as_json)
 
@@ -63,12 +63,14 @@ def tune(
 @app.command()
 def simulate(
     config: ConfigFile,
-    theta: Annotated[str | None, typer.Option(help='Values: "0.1,0.1,..." or JSON by name: \'{"backoff_V": [...]}\'. The file\'s by default.')] = None,
+    theta: Annotated[
+        str | None, typer.Option(help='Values: "0.1,0.1,..." or JSON by name: \'{"backoff_V": [...]}\'. The file\'s by default.')
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbances.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Run one closed loop of a study file at one theta."""
-    from chargetune.cli.simulate import simulate_command  # noqa: PLC0415
+    from chargetune.cli.simulate import simulate_command
 
     simulate_command(config, theta=theta, seed=seed, as_json=as_json)
 
@@ -80,7 +82,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """List the studies of a store, or the trials of one."""
-    from chargetune.cli.show import show_command  # noqa: PLC0415
+    from chargetune.cli.show import show_command
 
     show_command(store, study=study, as_json=as_json)
 
@@ -90,13 +92,17 @@ def reproduce(
     case: Annotated[CaseName, typer.Argument(help="What theta is: the backoff, the model's R1, or both.", show_default=False)],
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
     trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
-    tuner: Annotated[TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, or Sobol points.")] = TunerChoice.DEFAULT,
+    tuner: Annotated[
+        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, or Sobol points.")
+    ] = TunerChoice.DEFAULT,
     workers: Workers = 2,
-    out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path("out/reproduce"),
+    out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(
+        "out/reproduce"
+    ),
     as_json: AsJson = False,
 ) -> None:
     """Repeat a study of Hirt et al. (ADCHEM 2024) over mismatch seeds and decide its claims."""
-    from chargetune.cli.reproduce import reproduce_command  # noqa: PLC0415
+    from chargetune.cli.reproduce import reproduce_command
 
     reproduce_command(case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, as_json=as_json)
 
@@ -109,7 +115,7 @@ def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the opt
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: FBT002
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
 ) -> None:
     pass
 
@@ -125,9 +131,9 @@ def main() -> None:
         _refuse(error)
     except Exception as error:
         # Import only now: these modules are heavy, and are loaded already when one of them raised.
-        from chargetune.study.identity import StudyError  # noqa: PLC0415
-        from chargetune.study.runner import WorkerError  # noqa: PLC0415
-        from chargetune.study.sqlite import StoreError  # noqa: PLC0415
+        from chargetune.study.identity import StudyError
+        from chargetune.study.runner import WorkerError
+        from chargetune.study.sqlite import StoreError
 
         if not isinstance(error, (StudyError, StoreError, WorkerError)):
             raise

@@ -52,7 +52,9 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:
     """theta, one parameter a line."""
-    return "\n".join(f"  {name} = {value:.5g} {'' if unit == '1' else unit}".rstrip() for name, unit, value in zip(names, units, theta, strict=True))
+    return "\n".join(
+        f"  {name} = {value:.5g} {'' if unit == '1' else unit}".rstrip() for name, unit, value in zip(names, units, theta, strict=True)
+    )
 
 
 def trials_table(trials: Sequence[Trial]) -> Table:

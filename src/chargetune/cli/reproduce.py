@@ -18,7 +18,7 @@ __all__ = ["reproduce_command", "seed_list"]
 
 
 def seed_list(text: str) -> list[int]:
-    """"A:B" as range(A, B), or "A,B,C". Raises ValueError."""
+    """Seeds from the text ``A:B``, meaning range(A, B), or ``A,B,C``. Raises ValueError."""
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
@@ -34,7 +34,7 @@ def seed_list(text: str) -> list[int]:
 
 def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers: int, out: Path, as_json: bool) -> None:
     """Run the study for every seed, decide the claims, draw the figures."""
-    from chargetune.report import save_figures, seeds_figure  # noqa: PLC0415
+    from chargetune.report import save_figures, seeds_figure
 
     numbers, name = seed_list(seeds), cast("TunerName", tuner)
     out.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,11 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     for heading in ("", "claim", "holds"):
         table.add_column(heading)
     for claim in result["claims"]:
-        table.add_row(str(claim["id"]), claim["text"], f"{claim['holds']} of {claim['of']}" if claim["of"] else "needs the other study in the same --out")
+        table.add_row(
+            str(claim["id"]),
+            claim["text"],
+            f"{claim['holds']} of {claim['of']}" if claim["of"] else "needs the other study in the same --out",
+        )
     screen.print(table)
     screen.print(f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")))
 

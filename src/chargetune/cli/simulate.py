@@ -40,13 +40,20 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
             "kkt_worst": float(np.max(episode.kkt)),
             "theta": dict(zip(problem.space.entries, values.tolist(), strict=True)),
             "ending": episode.ending.value,
-            "score": {"objective": score.objective, "performance": score.performance, "excess": dict(score.excess), "feasible": score.feasible},
+            "score": {
+                "objective": score.objective,
+                "performance": score.performance,
+                "excess": dict(score.excess),
+                "feasible": score.feasible,
+            },
             "metrics": dict(score.metrics),
         }
         print(json.dumps(data))  # noqa: T201
         return
     out = console()
-    out.print(f"[bold]{problem.plant_cell.name}[/], {len(episode)} intervals of {problem.sampling_time_s:g} s, ended: {episode.ending.value}")
+    out.print(
+        f"[bold]{problem.plant_cell.name}[/], {len(episode)} intervals of {problem.sampling_time_s:g} s, ended: {episode.ending.value}"
+    )
     if problem.plant_cell.remark:
         out.print(f"[dim]{problem.plant_cell.remark}[/]")
     out.print(metrics_table({"this run": score}, problem))

@@ -21,7 +21,14 @@ __all__ = ["bar", "tune_command"]
 
 def bar(*, quiet: bool) -> Progress:
     """A progress bar on stderr, so that a program can read stdout."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
     return Progress(*columns, console=console(stderr=True), disable=quiet)
 
 
@@ -47,7 +54,9 @@ def tune_command(
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
         progress = stack.enter_context(bar(quiet=as_json))
-        task = progress.add_task("tuning", total=count, completed=min(done, count), note=f"resumed at trial {done}" if done else "")
+        task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
+        if done and not as_json:
+            progress.console.print(f"resumed: {done} trials are in {kept}")
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
@@ -61,7 +70,7 @@ def tune_command(
     best = tuned_trial(everything, config.study.tuner)
     figures: list[Path] = []
     if out is not None:
-        from chargetune.report import save_figures  # noqa: PLC0415
+        from chargetune.report import save_figures
 
         figures = save_figures(kept, config.study.name, out)
     summary = _summary(config, everything, best, problem.space.entries)
@@ -91,7 +100,13 @@ def _summary(config: Config, trials: list[Trial], best: Trial | None, names: tup
         if trial is None or trial.score is None:
             return None
         s = trial.score
-        return {"trial": trial.number, "feasible": s.feasible, "objective": s.objective, "excess": dict(s.excess), "metrics": dict(s.metrics)}
+        return {
+            "trial": trial.number,
+            "feasible": s.feasible,
+            "objective": s.objective,
+            "excess": dict(s.excess),
+            "metrics": dict(s.metrics),
+        }
 
     return {
         "study": config.study.name,

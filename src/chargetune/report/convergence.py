@@ -47,9 +47,10 @@ def convergence_figure(view: StudyView) -> Figure:
         label, scale = _excess_unit(view)
         _scales(upper, lower, [loss(view, t) for t in view.trials])
         marks = _marks(view)
-        for axis, value in ((upper, lambda t: loss(view, t)), (lower, lambda t: scale * worst_excess(t))):
-            for text, trials, style in marks:
-                axis.plot([t.number for t in trials], [value(t) for t in trials], label=text, linestyle="none", **style)
+        for text, trials, style in marks:
+            at = [t.number for t in trials]
+            upper.plot(at, [loss(view, t) for t in trials], label=text, linestyle="none", **style)
+            lower.plot(at, [scale * worst_excess(t) for t in trials], label=text, linestyle="none", **style)
         failed = [t.number for t in view.trials if t.status is TrialStatus.FAILED]
         for axis in (upper, lower):
             if failed:
@@ -68,6 +69,7 @@ def convergence_figure(view: StudyView) -> Figure:
         lower.set_ylabel(f"worst excess ({label})")
         lower.set_xlabel("trial")
         letter([upper, lower])
+        figure.align_ylabels()
         legend_above(figure, handles, columns=4 if len(handles) > 6 else 3)
     return figure
 
@@ -87,10 +89,10 @@ def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:
         ("within limits", [t for t in scored if t.feasible], {"marker": "o", "color": GREEN, "markersize": 3.5}),
         ("violating", [t for t in scored if not t.feasible], {"marker": "^", "color": RED, "markersize": 3.5, "fillstyle": "none"}),
     ]
-    for label, trial, color in (("untuned", view.untuned, BLUE), ("tuned", view.tuned, ORANGE)):
+    for label, trial, color in (("untuned", view.untuned, BLUE), (view.tuned_label, view.tuned, ORANGE)):
         if trial is not None and trial.score is not None:
-            ring = {"marker": "o", "color": color, "markersize": 8, "fillstyle": "none", "markeredgewidth": 1.4, "zorder": 4, "clip_on": False}
-            kinds.append((label, [trial], ring))
+            ring = {"marker": "o", "color": color, "markersize": 8, "fillstyle": "none", "markeredgewidth": 1.4}
+            kinds.append((label, [trial], {**ring, "zorder": 4, "clip_on": False}))
     return kinds
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.cell import Cell
+from chargetune.battery.charging import Backoff, ChargingProblem
 from chargetune.battery.ecm import FLOOR, table_nodes
 from chargetune.report.reading import StudyView
 from chargetune.report.style import BLUE, COLUMN_IN, GREEN, GREY, ORANGE, RED, cell_note, journal_style, legend_above, new_figure, words
@@ -22,10 +23,9 @@ __all__ = ["backoff_figure", "backoff_values", "resistance_figure", "resistance_
 SOC = np.linspace(0.0, 1.0, 201)
 
 
-def backoff_values(problem: ChargingProblem, nodes_V: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
-    """b(z) in V: the natural cubic spline through the backoff's nodes."""
-    assert problem.backoff is not None
-    return np.asarray(CubicSpline(problem.backoff.grid, nodes_V, bc_type="natural")(soc))
+def backoff_values(backoff: Backoff, nodes_V: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
+    """b(z) in the unit of its node values: a natural cubic spline."""
+    return np.asarray(CubicSpline(backoff.grid, np.asarray(nodes_V, dtype=float), bc_type="natural")(soc))
 
 
 def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
@@ -57,11 +57,12 @@ def backoff_figure(view: StudyView) -> Figure:
     with journal_style():
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
         nodes = {label: 1e3 * np.array(theta[part]) for label, theta in _thetas(view).items()}
-        drawn = {label: 1e3 * backoff_values(problem, values / 1e3) for label, values in nodes.items()}
-        handles = _grey(axis, [1e3 * backoff_values(problem, t.theta[part]) for t in view.others])
+        drawn = {label: backoff_values(problem.backoff, values) for label, values in nodes.items()}
+        handles = _grey(axis, [1e3 * backoff_values(problem.backoff, t.theta[part]) for t in view.others])
         for label, color in (("untuned", BLUE), ("tuned", ORANGE)):
             if label in drawn:
-                handles += axis.plot(100 * SOC, drawn[label], color=color, label=label, zorder=3)
+                text = view.tuned_label if label == "tuned" else label
+                handles += axis.plot(100 * SOC, drawn[label], color=color, label=text, zorder=3)
                 axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
         if "tuned" not in drawn:
             # b = 0 alone spans no range; that of the trials says what was tried.
@@ -71,7 +72,7 @@ def backoff_figure(view: StudyView) -> Figure:
         handles += beside.plot(100 * SOC, PchipInterpolator(cell.ocv_soc, cell.ocv_V)(SOC), color="black", linestyle=":", label="OCV")
         beside.set_ylabel("OCV (V)")
         axis.set_ylabel("backoff $b$ (mV)")
-        _finish(figure, axis, view, handles)
+        _finish(figure, axis, view, problem.plant_cell, handles)
     return figure
 
 
@@ -89,11 +90,12 @@ def resistance_figure(view: StudyView, of: Literal["R0", "R1"]) -> Figure:
         nodes = {"plant": true, **{label: believed * theta[part] for label, theta in _thetas(view).items()}}
         for label, color, marker in (("plant", GREEN, "s"), ("untuned", BLUE, "o"), ("tuned", ORANGE, "o")):
             if label in nodes:
-                handles += axis.plot(100 * SOC, 1e3 * resistance_values(problem, nodes[label]), color=color, label=label, zorder=3)
+                text = view.tuned_label if label == "tuned" else label
+                handles += axis.plot(100 * SOC, 1e3 * resistance_values(problem, nodes[label]), color=color, label=text, zorder=3)
                 axis.plot(100 * np.array(problem.plant_cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
         axis.set_ylim(bottom=0.0)
         axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")
-        _finish(figure, axis, view, handles)
+        _finish(figure, axis, view, problem.plant_cell, handles)
     return figure
 
 
@@ -112,8 +114,7 @@ def _grey(axis: Axes, rows: list[NDArray[np.float64]]) -> list[Any]:
     return [Line2D([], [], color=GREY, linewidth=0.8, label="trials")] if rows else []
 
 
-def _finish(figure: Figure, axis: Axes, view: StudyView, handles: list[Any]) -> None:
-    assert view.problem is not None
+def _finish(figure: Figure, axis: Axes, view: StudyView, cell: Cell, handles: list[Any]) -> None:
     if view.tuned is None:
         handles.append(words("tuned: none"))
     spans = [axis.axvspan(100 * low, 100 * high, color=RED, alpha=0.1, linewidth=0) for low, high in violated_soc(view)]
@@ -123,4 +124,4 @@ def _finish(figure: Figure, axis: Axes, view: StudyView, handles: list[Any]) -> 
     axis.set_xlim(0.0, 100.0)
     axis.set_xlabel("SOC (%)")
     legend_above(figure, handles, columns=3)
-    cell_note(figure, view.problem.plant_cell.name, view.problem.plant_cell.remark)
+    cell_note(figure, cell.name, cell.remark)

@@ -43,8 +43,13 @@ class StudyView:
 
     @property
     def tuned(self) -> Trial | None:
-        """The study's result: best feasible trial, for the tuner "ei" that of the best performance G; None when there is none."""
+        """The study's result, which `tuned_trial` decides; it need not have kept the limits. None when no trial has a score."""
         return tuned_trial(self.trials, self.tuner)
+
+    @property
+    def tuned_label(self) -> str:
+        """What a legend calls the tuned trial, so that nobody takes one that broke a limit for a success."""
+        return "tuned" if self.tuned is None or self.tuned.feasible else "tuned, violating"
 
     @property
     def others(self) -> tuple[Trial, ...]:

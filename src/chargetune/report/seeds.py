@@ -10,12 +10,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.report.style import BLUE, COLUMN_IN, GREY, ORANGE, PAGE_IN, RED, journal_style, legend_above, letter, new_figure, plain_symlog, save
+from chargetune.report.style import (
+    BLUE,
+    COLUMN_IN,
+    GREY,
+    ORANGE,
+    PAGE_IN,
+    RED,
+    journal_style,
+    legend_above,
+    letter,
+    new_figure,
+    plain_symlog,
+    save,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-__all__ = ["seeds_figure"]
+__all__ = ["draw_seeds", "seeds_figure"]
 
 PANELS = (("overshoot_mV", "overshoot (mV)"), ("t95_min", "time to 95 %\nSOC (min)"))
 # More seeds than this need the width of a page.
@@ -23,10 +37,15 @@ COLUMN_SEEDS = 12
 
 
 def seeds_figure(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Worst overshoot and t95 of every seed, untuned and tuned, with their medians; gives the file written.
+    """Write the figure of `draw_seeds` to ``path``, whose ending says the format: png, pdf or svg. Raises ValueError."""
+    return save(draw_seeds(rows), path)
+
+
+def draw_seeds(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Worst overshoot and t95 of every seed, untuned and tuned, with their medians.
 
     Each row has ``seed``, ``untuned`` and ``tuned`` (both with overshoot_mV and t95_min, None where SOC 95 % was not reached;
-    ``tuned`` None where no trial qualified) and may have ``attainable_t95_min``. Raises ValueError for no rows or an unknown format.
+    ``tuned`` None where no trial qualified) and may have ``attainable_t95_min``. Raises ValueError for no rows.
     """
     if not rows:
         raise ValueError("rows: empty, allowed is at least one seed")
@@ -56,9 +75,10 @@ def seeds_figure(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]
         axes[1].set_xticks(positions[::every], [str(row["seed"]) for row in rows][::every])
         axes[1].set_xlim(-0.7, len(rows) - 0.3)
         axes[1].set_xlabel("mismatch seed")
+        figure.align_ylabels()
         letter(axes)
         legend_above(figure, handles, columns=3 if len(rows) <= COLUMN_SEEDS else None)
-    return save(figure, path)
+    return figure
 
 
 def _panel(axis: Axes, rows: Sequence[Mapping[str, Any]], key: str) -> None:
@@ -68,20 +88,20 @@ def _panel(axis: Axes, rows: Sequence[Mapping[str, Any]], key: str) -> None:
     axis.vlines(positions[both], values["untuned"][both], values["tuned"][both], color=GREY, linewidth=0.8, zorder=1)
     for name, color, marker, aside in (("untuned", BLUE, "o", -0.15), ("tuned", ORANGE, "D", 0.15)):
         axis.plot(positions, values[name], marker, color=color, markersize=4, label=name, zorder=3)
-        median = _median(rows, name, key, values[name])
+        median = _median(rows, name, values[name])
         if np.isfinite(median):
             axis.axhline(median, color=color, linewidth=0.9, linestyle=":", label=f"median {name}", zorder=2)
         without = positions[np.isnan(values[name])]
         if without.size:
-            at = axis.get_xaxis_transform()
-            axis.plot(without + aside, [0.97] * without.size, "x", color=color, markersize=4, transform=at, label=f"{name}: no value", clip_on=False)
+            cross: dict[str, Any] = {"color": color, "markersize": 4, "clip_on": False, "label": f"{name}: no value"}
+            axis.plot(without + aside, [0.97] * without.size, "x", transform=axis.get_xaxis_transform(), **cross)
 
 
 def _numbers(values: Sequence[float | None]) -> NDArray[np.float64]:
     return np.array([np.nan if v is None else v for v in values], dtype=float)
 
 
-def _median(rows: Sequence[Mapping[str, Any]], name: str, key: str, values: NDArray[np.float64]) -> float:
+def _median(rows: Sequence[Mapping[str, Any]], name: str, values: NDArray[np.float64]) -> float:
     """Over the seeds that have a result; one that never reaches the SOC took longer than any that does."""
     there = np.array([row[name] is not None for row in rows])
     return float(np.median(np.where(np.isnan(values), np.inf, values)[there])) if there.any() else np.nan

@@ -64,7 +64,8 @@ def journal_style() -> Iterator[None]:
 
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update(RC)
+        settings: Any = mpl.rcParams
+        settings.update(RC)
         yield
 
 

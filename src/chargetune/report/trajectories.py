@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from chargetune.report.style import BLUE, GREY, ORANGE, PAGE_IN, RED, cell_note,
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 __all__ = ["curves", "trajectories_figure"]
 
@@ -59,21 +60,21 @@ def trajectories_figure(view: StudyView) -> Figure:
             axis.add_collection(lines)
         if grey:
             handles.append(Line2D([], [], color=GREY, linewidth=0.8, label="trials"))
-        shown = []
-        for label, trial, color in (("untuned", view.untuned, BLUE), ("tuned", view.tuned, ORANGE)):
+        shown, tuned = [], view.tuned
+        for label, trial, color in (("untuned", view.untuned, BLUE), (view.tuned_label, tuned, ORANGE)):
             episode = view.episode(trial)
             if trial is None or episode is None:
                 continue
             drawn = curves(episode)
             shown.append(drawn["voltage_V"][1])
-            text = f"{label} (trial {trial.number})" if label == "tuned" else label
+            text = f"{label} (trial {trial.number})" if trial is tuned else label
             for name, axis in panels.items():
                 signal, width = ("voltage_V", 0.7) if name == "near" else (name, 1.2)
                 axis.plot(*drawn[signal], color=color, linewidth=width, label=text, zorder=3)
             handles.append(panels["soc"].lines[-1])
-        if view.tuned is None:
+        if tuned is None:
             handles.append(words("tuned: none"))
-        handles.append(_limits(panels, problem))
+        handles.append(_limits(panels, problem)[-1])
         _frame(figure, panels, problem, shown or [c["voltage_V"][1] for c in grey])
         letter(axes)
         legend_above(figure, handles)
@@ -81,18 +82,15 @@ def trajectories_figure(view: StudyView) -> Figure:
     return figure
 
 
-def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> object:
-    assert problem.current_max_A is not None and problem.voltage_max_V is not None
-    style = {"color": RED, "linestyle": (0, (4, 2)), "linewidth": 0.9, "label": "limit", "zorder": 4}
-    for name, value in (("current_A", problem.current_max_A), ("voltage_V", problem.voltage_max_V), ("near", problem.voltage_max_V)):
-        line = panels[name].axhline(value, **style)
-    return line
+def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> list[Line2D]:
+    style: dict[str, Any] = {"color": RED, "linestyle": (0, (4, 2)), "linewidth": 0.9, "label": "limit", "zorder": 4}
+    limits = {"current_A": problem.current_max_A, "voltage_V": problem.voltage_max_V, "near": problem.voltage_max_V}
+    return [panels[name].axhline(value, **style) for name, value in limits.items() if value is not None]
 
 
 def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, voltages: list[NDArray[np.float64]]) -> None:
     limit = problem.voltage_max_V or 0.0
-    measured = np.concatenate(voltages)
-    peak = np.nanmax(measured, initial=limit)
+    peak = np.nanmax(np.concatenate([[limit], *voltages]))
     # Wild trials leave this panel: it is there to show the runs before and after tuning.
     margin = max(0.02, 1.25 * (peak - limit))
     panels["near"].set_ylim(limit - 0.8 * margin, limit + margin)

@@ -1,0 +1,75 @@
+"""Small real studies in stores: a charging problem, a tuner without learning, ten trials."""
+
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from scipy.stats import qmc
+
+from chargetune.battery.config import BackoffTable, Config, ControllerTable, EpisodeTable, LimitsTable, RatioTable, StudyTable, ThetaTable
+from chargetune.episode.episode import Ending
+from chargetune.study.store import Store
+from chargetune.study.study import Study
+
+TRIALS = 10
+CUT = 20
+
+
+@dataclass(frozen=True)
+class LocalSobol:
+    """theta_0, then scrambled Sobol points in the part of the unit cube within ``reach`` of theta_0."""
+
+    reach: float = 1.0
+    seed: int = 2
+
+    def ask(self, space, trials, n=1):
+        points = qmc.Sobol(space.dimension, rng=self.seed).random(64)
+        start = space.to_unit(space.default)
+        thetas = space.from_unit(start + self.reach * (points - start))
+        thetas[0] = space.default
+        return thetas[len(trials) : len(trials) + n]
+
+
+def charging(tuner="sobol", *, tolerance_V=0.0005):
+    """A configuration that tunes a backoff, R0 and R1; all have one structure, so that one compilation serves every test."""
+    return Config(
+        study=StudyTable(name="charge", tuner=tuner),
+        controller=ControllerTable(mismatch_seed=0, horizon=3),
+        limits=LimitsTable(tolerance_V=tolerance_V),
+        episode=EpisodeTable(steps=150),
+        theta=ThetaTable(backoff=BackoffTable(nodes=5), R0=RatioTable(), R1=RatioTable()),
+    )
+
+
+def run_charging(path, config, *, reach=0.7, cut=(), raising=()):
+    """Run the study; trials in ``cut`` fail and leave the start of their trace, those in ``raising`` fail without any."""
+    problem, numbers = config.problem(), count()
+
+    def evaluate(theta, seed):
+        number = next(numbers)
+        if number in raising:
+            raise RuntimeError("the cycler lost its connection")
+        score, episode, ending = problem(theta, seed)
+        if number in cut:
+            return None, episode.cut(CUT, Ending.LIMIT, "too hot"), "limit trip: too hot"
+        return score, episode, ending
+
+    with Store(path) as store, Study.create_or_resume(
+        store, config.study.name, config=config.document(), space=problem.space, tuner=LocalSobol(reach)
+    ) as study:
+        study.run(evaluate, TRIALS)
+    return path
+
+
+def lines(axis, color):
+    """Lines with data of one colour on an axis, in the order in which they were drawn."""
+    return [line for line in axis.lines if line.get_color() == color]
+
+
+def segments(axis):
+    """The grey curves."""
+    return [np.asarray(s) for collection in axis.collections for s in getattr(collection, "get_segments", list)()]
+
+
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
