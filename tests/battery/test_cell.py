@@ -11,7 +11,7 @@ import pytest
 from chargetune.battery.cell import Cell, default_cell, load_cell, mismatched
 
 NINE = tuple(i / 10 for i in range(1, 10))
-NAN, INF = math.nan, math.inf
+NAN, INF, YES = math.nan, math.inf, True
 
 
 def changed(values, index, value):
@@ -39,7 +39,7 @@ REFUSED = [
     ("ocv_V", changed(CELL.ocv_V, 5, 3.0), ("ocv_V[5] = 3 must be more than ocv_V[4] = 3.4193",)),
     ("ocv_V", CELL.ocv_V[:9], ("ocv_V has 9 values, expected 10",)),
     ("ocv_V", changed(CELL.ocv_V, 1, INF), ("ocv_V[1] = inf", "finite")),
-    ("ocv_V", changed(CELL.ocv_V, 1, True), ("ocv_V[1] = True", "finite number")),
+    ("ocv_V", changed(CELL.ocv_V, 1, YES), ("ocv_V[1] = True", "finite number")),
     ("ocv_V", tuple(1000 * v for v in CELL.ocv_V), ("ocv_V[0] = 2500", "at most 5 V", "mV?")),
     ("ocv_V", changed(CELL.ocv_V, 9, 6.0), ("ocv_V[-1] = 6", "at most 5 V")),
     ("ocv_soc", (0.0, 0.5, 1.0), ("ocv_soc has 3 values", "at least 4")),
@@ -147,7 +147,10 @@ def test_mismatch_is_that_of_the_reference(cell, shared, seed):
 
 def toml(cell, **changes):
     data = asdict(cell)
-    tables = {"ecm": {k: data.pop(k) for k in ("soc", "R0_ohm", "R1_ohm", "C1_F")}, "ocv": {"soc": data.pop("ocv_soc"), "V": data.pop("ocv_V")}}
+    tables = {
+        "ecm": {k: data.pop(k) for k in ("soc", "R0_ohm", "R1_ohm", "C1_F")},
+        "ocv": {"soc": data.pop("ocv_soc"), "V": data.pop("ocv_V")},
+    }
     lines = [f"{k} = {json.dumps(v)}" for k, v in (data | changes).items() if v is not None]
     for table, values in tables.items():
         lines += [f"[{table}]", *(f"{k} = {json.dumps(v)}" for k, v in values.items())]

@@ -81,7 +81,7 @@ def test_open_circuit_voltage_rises_and_passes_through_its_table():
     fine = np.array([outputs([z, 0.0], 0.0)[0] for z in np.linspace(-0.05, 1.05, 2201)])
     assert np.all(np.diff(fine) > 0)
     at_nodes = [outputs([z, 0.0], 0.0)[0] for z in CELL.ocv_soc]
-    np.testing.assert_allclose(at_nodes, CELL.ocv_V, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(at_nodes, CELL.ocv_V, rtol=0, atol=1e-9)
 
 
 def resistance(model, z, current=1e3):
@@ -153,7 +153,7 @@ def test_parameters_are_run_time_values():
     np.testing.assert_array_equal(outputs([0.4, 0.1], 3.0, moved), outputs([0.4, 0.1], 3.0, built))
 
 
-@pytest.mark.parametrize("step", [0.0, -10.0, float("nan"), True, "10"])
+@pytest.mark.parametrize("step", [0.0, -10.0, float("nan"), float("inf"), True])
 def test_refuses_a_sampling_time(step):
-    with pytest.raises((ValueError, TypeError), match="sampling_time_s|unsupported|bad operand"):
+    with pytest.raises(ValueError, match=r"sampling_time_s = .*, allowed is a finite number > 0"):
         ecm_model(CELL, step)

@@ -15,7 +15,7 @@ from chargetune.report.style import BLUE, GREEN, ORANGE
 def model_resistances(cell, soc):
     """R0 and R1 of the circuit by what it does: the jump of V for 1 A, and U1 after a step that outlasts R1 C1."""
     model = ecm_model(cell, 1e6)
-    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.DM(model.p_default)
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.DM(model.nominal)
     step = ca.Function("step", [x, u], [model.f(x, u, p), model.h(x, u, p)])
     after = [[step([z, 0.0], current) for current in (0.0, 1.0)] for z in soc]
     r0 = [float(one[1][0] - none[1][0]) for none, one in after]

@@ -229,7 +229,7 @@ class ChargingProblem:
         _, soc = episode.signal("soc")
         highest, lowest = np.maximum(start, end), np.minimum(start, end)
         above, below = highest - (self.voltage_max_V or 0.0), (self.voltage_min_V or 0.0) - lowest
-        if not (len(soc) and np.all(np.isfinite(highest)) and np.all(np.isfinite(soc))):
+        if not (len(soc) and all(np.all(np.isfinite(values)) for values in (start, end, soc))):
             raise ValueError("the episode has no score: a measured voltage or SOC is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
         over = np.maximum(0.0, above) ** 2

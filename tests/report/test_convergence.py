@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from report_studies import legend, lines
+
+from chargetune.episode.score import Score
+from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.report import read_study
+from chargetune.report.convergence import convergence_figure, incumbents
+from chargetune.report.reading import StudyView
+from chargetune.report.style import BLUE, GREEN, ORANGE, RED
+from chargetune.study.trial import Trial, TrialStatus
+
+DONE, FAILED, RUNNING = TrialStatus.DONE, TrialStatus.FAILED, TrialStatus.RUNNING
+
+
+def view_of(outcomes, tuner="default"):
+    """Trials of (objective, performance, excess), "failed" or "running"; a study that is not about a battery."""
+    trials = [
+        Trial(n, (0.1 * n,), TrialStatus(o)) if isinstance(o, str) else Trial(n, (0.1 * n,), DONE, Score(o[0], o[1], {"speed": o[2]}, {"speed": 0.5}))
+        for n, o in enumerate(outcomes)
+    ]
+    return StudyView("nowhere", "toy", tuner, ParameterSpace((Parameter("x", 0.0, 1.0, 0.0),)), tuple(trials), None)
+
+
+TABLE = [(-1.0, -9.0, 5.0), (-4.0, -4.0, 0.4), "failed", (-3.0, -5.0, 0.6), (-2.0, -6.0, 0.0), (-2.5, -2.5, -1.0), "running"]
+NAN = np.nan
+
+
+@pytest.mark.parametrize(
+    ("tuner", "best"),
+    [("default", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), ("sobol", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), ("ei", [9.0, 4.0, 4.0, 4.0, 4.0, 2.5, 2.5])],
+)
+def test_incumbents(tuner, best):
+    view = view_of(TABLE, tuner)
+    np.testing.assert_array_equal(incumbents(view), best)
+    (line,) = [x for x in lines(convergence_figure(view).axes[0], ORANGE) if x.get_drawstyle() == "steps-post"]
+    np.testing.assert_array_equal(line.get_xdata(), range(7))
+    np.testing.assert_array_equal(line.get_ydata(), best)
+
+
+def test_marks_say_what_became_of_each_trial():
+    figure = convergence_figure(view_of(TABLE))
+    upper, lower = figure.axes
+    shown = {line.get_label(): line for line in upper.lines}
+    for label, marker, color, numbers, values in (
+        ("within limits", "o", GREEN, [1, 4, 5], [4.0, 2.0, 2.5]),
+        ("violating", "^", RED, [0, 3], [1.0, 3.0]),
+        ("untuned", "o", BLUE, [0], [1.0]),
+        ("tuned", "o", ORANGE, [4], [2.0]),
+    ):
+        assert shown[label].get_marker() == marker
+        assert shown[label].get_color() == color
+        assert list(shown[label].get_xdata()) == numbers
+        assert list(shown[label].get_ydata()) == values
+    below = {line.get_label(): line for line in lower.lines}
+    assert list(below["within limits"].get_ydata()) == [0.4, 0.0, -1.0]
+    assert list(below["violating"].get_ydata()) == [5.0, 0.6]
+    assert list(below["limit"].get_ydata()) == [0.0, 0.0]
+    assert list(below["tolerance"].get_ydata()) == [0.5, 0.5]
+    for axis in (shown, below):
+        assert list(axis["failed"].get_xdata()) == [2]
+        assert axis["failed"].get_marker() == "x"
+    assert legend(figure) == ["within limits", "violating", "untuned", "tuned", "failed", "best so far", "limit", "tolerance"]
+    assert (upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()) == ("−objective", "worst excess (unit of the limit)", "trial")
+
+
+@pytest.mark.parametrize(
+    ("losses", "scale"), [([1.0, 2.0, 9.0], "linear"), ([1.0, 20.0, 3.0], "log"), ([0.0, 20.0], "linear"), ([-1.0, 20.0], "linear")]
+)
+def test_axis_is_logarithmic_where_that_helps(losses, scale):
+    figure = convergence_figure(view_of([(-v, -v, 0.0) for v in losses]))
+    assert figure.axes[0].get_yscale() == scale
+    figure.canvas.draw()
+
+
+def test_only_failures():
+    figure = convergence_figure(view_of(["failed", "failed", "running"]))
+    figure.canvas.draw()
+    assert legend(figure) == ["failed", "limit"]
+    assert list(figure.axes[0].lines[-1].get_xdata()) == [0, 1]
+
+
+def test_charging_study_in_its_units(stores):
+    view = read_study(stores["mixed"], "charge")
+    upper, lower = convergence_figure(view).axes
+    assert upper.get_ylabel() == "mean of $(z_d - z)^2$"
+    assert lower.get_ylabel() == "worst excess (mV)"
+    ring = next(line for line in lower.lines if line.get_label() == "tuned")
+    (worst,) = ring.get_ydata()
+    assert worst == pytest.approx(view.trials[8].score.metrics["overshoot_mV"], rel=1e-12)
+    assert to_hex(ring.get_color()) == ORANGE.lower()
+    (tolerance,) = [line for line in lower.lines if line.get_label() == "tolerance"]
+    assert tolerance.get_ydata()[0] == pytest.approx(35.0)
+
+
+def test_performance_of_the_paper(stores):
+    view = read_study(stores["ei"], "charge")
+    upper = convergence_figure(view).axes[0]
+    assert upper.get_ylabel() == "$-G$"
+    ring = next(line for line in upper.lines if line.get_label().startswith("tuned"))
+    assert list(ring.get_ydata()) == [min(-t.score.performance for t in view.trials)]
+
+
+def test_no_feasible_trial_leaves_no_incumbent(stores):
+    view = read_study(stores["violating"], "charge")
+    figure = convergence_figure(view)
+    assert np.isnan(incumbents(view)).all()
+    assert legend(figure) == ["violating", "untuned", "tuned, violating", "limit", "tolerance"]
+
+
+def test_tolerances_that_differ_have_no_common_line():
+    view = view_of(TABLE)
+    score = replace(view.trials[0].score, tolerance={"speed": 0.1})
+    figure = convergence_figure(replace(view, trials=(replace(view.trials[0], score=score), *view.trials[1:])))
+    assert "tolerance" not in legend(figure)
