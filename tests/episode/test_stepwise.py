@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.control.mpc import act
 from chargetune.control.sqp import SolveStatus
-from chargetune.episode import stepwise
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
 from chargetune.episode.stepwise import run_episode, signal_indices
 from chargetune.model.model import Model, Signal
@@ -126,27 +126,35 @@ def test_a_plant_that_cannot_be_closed_is_the_news(tank_controller, tank_plant, 
     assert plant.closes == 1
 
 
-def test_an_error_in_the_controller_leaves_the_plant_safe(tank_controller, tank_plant, monkeypatch):
-    calls = []
+def out_of_memory(_u):
+    raise RuntimeError("out of memory")
 
-    def act(*arguments):
-        calls.append(arguments)
-        if len(calls) == 4:
-            raise RuntimeError("out of memory")
-        return original(*arguments)
 
-    original = stepwise.act
-    monkeypatch.setattr(stepwise, "act", act)
+@pytest.mark.parametrize(
+    ("fourth", "message"),
+    [
+        (out_of_memory, "the controller raised RuntimeError: out of memory"),
+        (lambda u: u * math.nan, "the controller raised ValueError: input = [nan], allowed are 1 finite numbers"),
+        (lambda u: np.concatenate([u, u]), "allowed are 1 finite numbers"),
+    ],
+)
+def test_a_broken_control_step_leaves_the_plant_safe(tank_controller, tank_plant, fourth, message):
     plant = Watched(tank_plant())
-    episode = run_episode(tank_controller(), plant, steps=9)
-    assert (episode.ending, len(episode), plant.closes) == (Ending.SOLVER, 3, 1)
-    assert episode.message == "the controller raised RuntimeError: out of memory"
+
+    def control(*arguments):
+        u, memory, info = act(*arguments)
+        return (fourth(u) if len(plant.inputs_seen) == 3 else u), memory, info
+
+    episode = run_episode(tank_controller(), plant, steps=9, control=control)
+    assert (episode.ending, len(episode), len(plant.inputs_seen), plant.closes) == (Ending.SOLVER, 3, 3, 1)
+    assert message in episode.message
 
 
 def test_a_blind_controller_stops(tank_controller, tank_plant):
     plant = Watched(Faulty(tank_plant(), [Fault(FaultKind.MISSING, 4, 100)]))
     episode = run_episode(tank_controller(), plant, steps=20)
     assert (episode.ending, len(episode), plant.closes) == (Ending.SENSOR, 4 + BLIND_MAX, 1)
+    assert len(plant.inputs_seen) == 4 + BLIND_MAX
     # The estimator's own prediction stood in for the missing measurement.
     assert set(episode.status) == {SolveStatus.CONVERGED}
 

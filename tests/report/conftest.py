@@ -7,7 +7,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from report_studies import charging, run_charging  # noqa: E402
+from report_studies import charging, run_charging
+
+from chargetune.report import save_figures
 
 
 @pytest.fixture(scope="session")
@@ -20,3 +22,10 @@ def stores(tmp_path_factory):
         "ei": run_charging(folder / "ei.sqlite", charging("ei")),
         "failed": run_charging(folder / "failed.sqlite", loose, raising=range(10)),
     }
+
+
+@pytest.fixture(scope="session")
+def files(stores, tmp_path_factory):
+    """All figures of one study in all formats, by file name."""
+    folder = tmp_path_factory.mktemp("figures") / "new" / "folder"
+    return {f.name: f for f in save_figures(stores["mixed"], "charge", folder, ("png", "pdf", "svg"))}

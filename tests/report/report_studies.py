@@ -54,9 +54,10 @@ def run_charging(path, config, *, reach=0.7, cut=(), raising=()):
             return None, episode.cut(CUT, Ending.LIMIT, "too hot"), "limit trip: too hot"
         return score, episode, ending
 
-    with Store(path) as store, Study.create_or_resume(
-        store, config.study.name, config=config.document(), space=problem.space, tuner=LocalSobol(reach)
-    ) as study:
+    with (
+        Store(path) as store,
+        Study.create_or_resume(store, config.study.name, config=config.document(), space=problem.space, tuner=LocalSobol(reach)) as study,
+    ):
         study.run(evaluate, TRIALS)
     return path
 

@@ -19,7 +19,9 @@ DONE, FAILED, RUNNING = TrialStatus.DONE, TrialStatus.FAILED, TrialStatus.RUNNIN
 def view_of(outcomes, tuner="default"):
     """Trials of (objective, performance, excess), "failed" or "running"; a study that is not about a battery."""
     trials = [
-        Trial(n, (0.1 * n,), TrialStatus(o)) if isinstance(o, str) else Trial(n, (0.1 * n,), DONE, Score(o[0], o[1], {"speed": o[2]}, {"speed": 0.5}))
+        Trial(n, (0.1 * n,), TrialStatus(o))
+        if isinstance(o, str)
+        else Trial(n, (0.1 * n,), DONE, Score(o[0], o[1], {"speed": o[2]}, {"speed": 0.5}))
         for n, o in enumerate(outcomes)
     ]
     return StudyView("nowhere", "toy", tuner, ParameterSpace((Parameter("x", 0.0, 1.0, 0.0),)), tuple(trials), None)
@@ -31,7 +33,11 @@ NAN = np.nan
 
 @pytest.mark.parametrize(
     ("tuner", "best"),
-    [("default", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), ("sobol", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), ("ei", [9.0, 4.0, 4.0, 4.0, 4.0, 2.5, 2.5])],
+    [
+        ("default", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]),
+        ("sobol", [NAN, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0]),
+        ("ei", [9.0, 4.0, 4.0, 4.0, 4.0, 2.5, 2.5]),
+    ],
 )
 def test_incumbents(tuner, best):
     view = view_of(TABLE, tuner)
@@ -48,7 +54,7 @@ def test_marks_say_what_became_of_each_trial():
     for label, marker, color, numbers, values in (
         ("within limits", "o", GREEN, [1, 4, 5], [4.0, 2.0, 2.5]),
         ("violating", "^", RED, [0, 3], [1.0, 3.0]),
-        ("untuned", "o", BLUE, [0], [1.0]),
+        ("untuned", "s", BLUE, [0], [1.0]),
         ("tuned", "o", ORANGE, [4], [2.0]),
     ):
         assert shown[label].get_marker() == marker
@@ -60,9 +66,8 @@ def test_marks_say_what_became_of_each_trial():
     assert list(below["violating"].get_ydata()) == [5.0, 0.6]
     assert list(below["limit"].get_ydata()) == [0.0, 0.0]
     assert list(below["tolerance"].get_ydata()) == [0.5, 0.5]
-    for axis in (shown, below):
-        assert list(axis["failed"].get_xdata()) == [2]
-        assert axis["failed"].get_marker() == "x"
+    assert list(shown["failed"].get_xdata()) == [2]
+    assert shown["failed"].get_marker() == "x"
     assert legend(figure) == ["within limits", "violating", "untuned", "tuned", "failed", "best so far", "limit", "tolerance"]
     assert (upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()) == ("−objective", "worst excess (unit of the limit)", "trial")
 
@@ -80,7 +85,12 @@ def test_only_failures():
     figure = convergence_figure(view_of(["failed", "failed", "running"]))
     figure.canvas.draw()
     assert legend(figure) == ["failed", "limit"]
+    assert not list(figure.axes[0].get_yticks()), "there is nothing to read off"
     assert list(figure.axes[0].lines[-1].get_xdata()) == [0, 1]
+
+
+def test_failures_do_not_change_the_unit(stores):
+    assert convergence_figure(read_study(stores["failed"], "charge")).axes[1].get_ylabel() == "worst excess (mV)"
 
 
 def test_charging_study_in_its_units(stores):

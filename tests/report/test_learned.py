@@ -50,6 +50,9 @@ def test_violated_soc_covers_exactly_the_violating_intervals(stores):
     inside = np.array([any(low <= a and b <= high for low, high in spans) for a, b in zip(soc_start, soc_end, strict=True)])
     assert spans
     assert np.array_equal(inside, highest > 4.2005)
+    for figure in (backoff_figure(view), resistance_figure(view, "R1")):
+        drawn = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in figure.axes[0].patches]
+        np.testing.assert_allclose(drawn, 100 * np.array(spans))
     assert violated_soc(read_study(stores["failed"], "charge")) == []
 
 
@@ -104,6 +107,14 @@ def test_untuned_controller_needs_no_trial(stores):
     assert backoff_figure(view).axes[0].get_ylim() == (-260.0, 260.0), "the box of the backoff"
 
 
+def test_untuned_run_shows_through_when_it_is_the_tuned_one_too(stores):
+    view = read_study(stores["mixed"], "charge", trials=1)
+    for figure in (backoff_figure(view), resistance_figure(view, "R0")):
+        assert lines(figure.axes[0], BLUE)[0].get_linestyle() == "-"
+        assert lines(figure.axes[0], ORANGE)[0].get_linestyle() == "--"
+    assert backoff_figure(view).axes[0].get_ylim() == (-260.0, 260.0)
+
+
 def test_a_violating_result_is_called_so(stores):
     view = read_study(stores["violating"], "charge")
     assert "tuned, violating" in legend(backoff_figure(view))
@@ -121,9 +132,9 @@ def test_what_is_not_tuned_is_refused(stores):
 
 def test_a_remark_is_text_and_no_formula(stores):
     view = read_study(stores["mixed"], "charge")
-    cell = replace(view.problem.plant_cell, remark="costs $3 and $4 _{x")
+    cell = replace(view.problem.plant_cell, remark=r"costs $\frac{$")
     figure = backoff_figure(replace(view, problem=replace(view.problem, plant_cell=cell)))
     figure.canvas.draw()
-    assert "costs $3 and $4 _{x" in figure.get_supxlabel()
+    assert r"costs $\frac{$" in figure.get_supxlabel()
     silent = replace(cell, remark="")
     assert not backoff_figure(replace(view, problem=replace(view.problem, plant_cell=silent))).get_supxlabel()

@@ -67,7 +67,8 @@ def test_medians_count_a_charge_that_never_arrives_as_the_slowest():
 def test_missing_values_are_marked():
     upper, lower = draw_seeds(ROWS).axes
     crosses = [
-        [(line.get_label(), np.round(line.get_xdata()).tolist()) for line in axis.lines if line.get_marker() == "x"] for axis in (upper, lower)
+        [(line.get_label(), np.round(line.get_xdata()).tolist()) for line in axis.lines if line.get_marker() == "x"]
+        for axis in (upper, lower)
     ]
     assert crosses[0] == [("tuned: no value", [3])]
     assert crosses[1] == [("untuned: no value", [2]), ("tuned: no value", [2, 3])]

@@ -55,7 +55,8 @@ def test_limits_and_frame(stores):
         assert all(line.is_dashed() for line in red)
         assert axis.get_xlim() == (0.0, 25.0)
     low, high = axes[3].get_ylim()
-    assert low < 4.2 < 4.238 < high < 4.3
+    assert 4.1 < low < 4.2, "the limit is in view"
+    assert 4.238 < high < 4.3, "the untuned overshoot is in view, the trials' may not be"
 
 
 def test_legend_names_what_is_drawn(stores):
@@ -63,6 +64,13 @@ def test_legend_names_what_is_drawn(stores):
     number = read_study(stores["violating"], "charge").tuned.number
     assert said["mixed"] == ["trials", "untuned", "tuned (trial 8)", "limit"]
     assert said["violating"] == ["trials", "untuned", f"tuned, violating (trial {number})", "limit"]
+
+
+def test_untuned_run_shows_through_when_it_is_the_tuned_one_too(stores):
+    figure = trajectories_figure(read_study(stores["mixed"], "charge", trials=1))
+    assert legend(figure) == ["untuned", "tuned, violating (trial 0)", "limit"]
+    for axis in figure.axes:
+        assert [lines(axis, color)[0].get_linestyle() for color in (BLUE, ORANGE)] == ["-", "--"]
 
 
 def test_failed_trials_are_shown_as_far_as_they_came(stores):

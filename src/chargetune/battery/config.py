@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -123,8 +122,11 @@ class Config(_Table):
     objective: ObjectiveTable = ObjectiveTable()
     theta: ThetaTable = ThetaTable()
 
-    def problem(self, folder: Path | None = None) -> ChargingProblem:
-        """The charging problem; a relative cell file is looked for in ``folder``. Raises ValueError, FileNotFoundError."""
+    def problem(self, folder: Path | None = None, *, cell: Cell | None = None) -> ChargingProblem:
+        """The charging problem; a relative cell file is looked for in ``folder``, ``cell`` stands in for the file's.
+
+        Raises ValueError, FileNotFoundError.
+        """
         theta = self.theta
         ratios = [ResistanceRatio("R0", theta.R0.lower, theta.R0.upper)] if theta.R0 else []
         ratios += [ResistanceRatio("R1", theta.R1.lower, theta.R1.upper)] if theta.R1 else []
@@ -135,7 +137,7 @@ class Config(_Table):
             delay_steps=self.sensors.delay_steps,
         )
         return ChargingProblem(
-            plant_cell=self._cell(folder),
+            plant_cell=cell or self._cell(folder),
             backoff=Backoff(**theta.backoff.model_dump()) if theta.backoff else None,
             ratios=tuple(ratios),
             sensors=sensors,
@@ -168,7 +170,7 @@ def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
     cell: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in document["cell"].items()}
     tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
-    return replace(Config.model_validate(tables).problem(), plant_cell=Cell(**cell))
+    return Config.model_validate(tables).problem(cell=Cell(**cell))
 
 
 def load_config(path: str | Path) -> Config:

@@ -75,5 +75,5 @@ def compile_library(name: str, sources: tuple[str, ...], defines: tuple[str, ...
         if done.returncode != 0:
             raise RuntimeError(f"the C compiler failed: {shlex.join(command)}\n{done.stderr.strip()}")
         # Two processes may build the same content: the last rename wins and both are right.
-        os.replace(built, target)
+        built.replace(target)
     return target

@@ -21,6 +21,7 @@ from chargetune.model.parameters import ParameterSpace
 __all__ = ["Controller", "Limit", "SoftLimit", "Stage"]
 
 HORIZON_MAX = 50
+CONVEXITY_POINTS = 8
 At = Literal["start", "end", "both", "terminal"]
 
 
@@ -202,7 +203,7 @@ class _Symbols:
     """One set of symbols, so that all functions of a controller have the same arguments."""
 
     def __init__(self, model: Model, theta: ParameterSpace) -> None:
-        self.model = model
+        self.model, self.space = model, theta
         sizes = {p.name: p.size for p in theta.parameters}
         nx, nu, np_ = len(model.states), len(model.inputs), sum(model.parameter_blocks.values())
         self.x, self.u, self.p = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_)
@@ -241,7 +242,28 @@ class _Symbols:
             raise ValueError(f"controller: {label} has shape {value.shape}, expected a scalar")
         if not with_input and ca.depends_on(value, self.u):
             raise ValueError(f"controller: {label} depends on the input, allowed are x, theta, p, now and the set-point")
-        return self._function(label, [self.x, self.u, self.theta, self.p, self.setpoint, self.now], value)
+        function = self._function(label, [self.x, self.u, self.theta, self.p, self.setpoint, self.now], value)
+        self._check_convex(label, value)
+        return function
+
+    def _check_convex(self, label: str, value: Any) -> None:
+        """Look at the curvature in (x, u) at random points; the solver needs a model of the cost that is bounded below."""
+        curvature, _ = ca.hessian(value, ca.vertcat(self.x, self.u))
+        symbols = [self.x, self.u, self.theta, self.p, self.setpoint, self.now]
+        evaluate = ca.Function("curvature", symbols, [curvature])
+        draw = np.random.default_rng(0)
+        lower, upper = self.space.lower, self.space.upper
+        for _ in range(CONVEXITY_POINTS):
+            theta = draw.uniform(lower, upper) if lower.size else np.zeros(0)
+            x, u, setpoint, now = (draw.uniform(-1.0, 1.0, s.shape[0]) for s in (self.x, self.u, self.setpoint, self.now))
+            matrix = np.array(evaluate(x, u, theta, self.model.nominal, setpoint, now))
+            if not np.all(np.isfinite(matrix)):
+                continue
+            values = np.linalg.eigvalsh(matrix)
+            if values[0] < -1e-9 * (1.0 + abs(values[-1])):
+                raise ValueError(
+                    f"controller: {label} has curvature {values[0]:.3g} in (x, u), allowed is a convex function (curvature >= 0)"
+                )
 
     def limit(self, limit: SoftLimit) -> Limit:
         model, s = self.model, self.stage

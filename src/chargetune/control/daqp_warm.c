@@ -40,6 +40,21 @@ const long long *JOIN(QP_NAME, _sparsity_out)(long long i) { return i == 0 ? col
 /* Below this a row counts as kept; far above rounding, far below the tolerance of the optimality check. */
 #define ROW_TOLERANCE 1e-9
 
+/* Fill the working set: bounds that coincide always, then what the guess says; stops at the first dependent one. */
+static void start_from(DAQPWorkspace *work, const double *guess) {
+  int i;
+  for (i = 0; i < work->m; ++i)
+    if ((work->sense[i] & IMMUTABLE) && (work->sense[i] & ACTIVE)) add_constraint(work, i, 1.0);
+  for (i = 0; guess && i < work->m && work->n_active < work->n && work->sing_ind == EMPTY_IND; ++i) {
+    const double g = guess[i];
+    if (!(g > 0 || g < 0) || (work->sense[i] & (ACTIVE + IMMUTABLE))) continue;
+    if (g < 0 && work->qp->blower[i] <= -DAQP_INF) continue;
+    if (g > 0 && work->qp->bupper[i] >= DAQP_INF) continue;
+    if (g < 0) work->sense[i] |= LOWER;
+    add_constraint(work, i, g);
+  }
+}
+
 int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem) {
   double a[QP_M * VARS + 1], lower[CONS], upper[CONS];
   double rinv[(VARS + 1) * VARS / 2], m[QP_M * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
@@ -112,18 +127,13 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
     reset_daqp_workspace(&work);
     result.exitflag = update_ldp(UPDATE_ALL, &work);
     if (result.exitflag < 0) break;
-    for (i = 0; i < VARS + kept && work.n_active < VARS; ++i) {
-      const double g = guess[i];
-      if (!(g > 0 || g < 0) || (sense[i] & (ACTIVE + IMMUTABLE))) continue;
-      if (g < 0 && lower[i] <= -DAQP_INF) continue;
-      if (g < 0) sense[i] |= LOWER;
-      add_constraint(&work, i, g);
-      if (work.sing_ind != EMPTY_IND) {
-        /* Dependent guesses: start from nothing. */
-        for (j = 0; j < VARS + kept; ++j) sense[j] &= ~(ACTIVE + LOWER);
-        reset_daqp_workspace(&work);
-        break;
-      }
+    start_from(&work, guess);
+    if (work.sing_ind != EMPTY_IND) {
+      /* Dependent guesses: start from nothing. */
+      for (i = 0; i < VARS + kept; ++i)
+        if (!(sense[i] & IMMUTABLE)) sense[i] &= ~(ACTIVE + LOWER);
+      reset_daqp_workspace(&work);
+      start_from(&work, NULL);
     }
     daqp_solve(&result, &work);
     if (result.exitflag <= 0) break;

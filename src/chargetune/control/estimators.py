@@ -109,7 +109,9 @@ class ExtendedKalman:
 
     def __post_init__(self) -> None:
         if len(self.measured) != len(self.measurement_sd) or not self.measured:
-            raise ValueError(f"estimator: measurement_sd has {len(self.measurement_sd)} values, expected one for each of {list(self.measured)}")
+            raise ValueError(
+                f"estimator: measurement_sd has {len(self.measurement_sd)} values, expected one for each of {list(self.measured)}"
+            )
         for name, least in (("measurement_sd", 0.0), ("process_sd", 0.0), ("start_sd", 0.0)):
             values = getattr(self, name)
             strict = name == "measurement_sd"
@@ -122,7 +124,9 @@ class ExtendedKalman:
             raise ValueError(f"estimator: measured = {unknown}, allowed are {', '.join(model.output_names)}")
         for name in ("process_sd", "start_sd"):
             if len(getattr(self, name)) != len(model.states):
-                raise ValueError(f"estimator: {name} has {len(getattr(self, name))} values, expected one for each of {list(model.state_names)}")
+                raise ValueError(
+                    f"estimator: {name} has {len(getattr(self, name))} values, expected one for each of {list(model.state_names)}"
+                )
         return self.measured
 
     def initial(self, model: Model, state: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from chargetune.control.ocp import Problem, control_problem
 from chargetune.control.qp import QPSolver, daqp
 from chargetune.control.sqp import SolveStatus, cold, solver
 
-__all__ = ["Info", "Memory", "act", "begin", "cached", "control_step", "problem_of"]
+__all__ = ["Act", "Info", "Memory", "act", "begin", "cached", "control_step", "problem_of"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,13 @@ def begin(controller: Controller) -> Memory:
     return Memory(initial, no_input, cold(problem_of(controller), no_input))
 
 
-def act(controller: Controller, received: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory) -> tuple[NDArray[np.float64], Memory, Info]:
+# (controller, received, theta, memory) -> (input, memory, info)
+Act = Callable[[Controller, NDArray[np.float64], NDArray[np.float64], Memory], tuple[NDArray[np.float64], Memory, Info]]
+
+
+def act(
+    controller: Controller, received: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory
+) -> tuple[NDArray[np.float64], Memory, Info]:
     """One control step: the input for the next interval, the new memory and how the solve went.
 
     ``received`` holds the signals that the estimator reads, in its order. The input, shape (nu,), is finite and within

@@ -116,9 +116,7 @@ def control_problem(controller: Controller) -> Problem:
 
     stage = _Linearisation.of(x, u, after, stage_cost, stage_rows)
     final = _Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
-    groups = tuple(
-        [*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal")]
-    )
+    groups = (*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal"))
     packed_stage = ca.Function("stage", [x, u, now, q], _cse(after, stage_cost, stage_rows, stage.packed))
     packed_final = ca.Function("final", [x, now, q], _cse(final_cost, final_rows, final.packed))
     return Problem(
@@ -220,7 +218,7 @@ def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, hori
 
 def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
     horizon, limits = controller.horizon, controller.limits
-    nx, nu = len(controller.model.states), len(controller.model.inputs)
+    nu = len(controller.model.inputs)
     size = horizon * nu
     inputs, lower, upper = (ca.SX.sym(n, size) for n in ("U", "lower", "upper"))
     rows, vector = ca.SX.sym("c", len(groups)), ca.SX.sym("D", horizon * stage.length + final.length)
@@ -234,7 +232,9 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
     for i, (f_x, f_u, c_x, c_u, *_) in enumerate(stages):
         scale = ca.diag(ranges[i])
         history.append(list(sensitivity))
-        jacobian.append(ca.horzcat(*(ca.mtimes(c_x, s) for s in sensitivity), ca.mtimes(c_u, scale), ca.SX(c_x.shape[0], size - (i + 1) * nu)))
+        jacobian.append(
+            ca.horzcat(*(ca.mtimes(c_x, s) for s in sensitivity), ca.mtimes(c_u, scale), ca.SX(c_x.shape[0], size - (i + 1) * nu))
+        )
         sensitivity = [*(ca.mtimes(f_x, s) for s in sensitivity), ca.mtimes(f_u, scale)]
     jacobian.append(ca.horzcat(*(ca.mtimes(last[2], s) for s in sensitivity)))
 

@@ -103,7 +103,9 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     """One SQP iteration: (now, U, c, D, merit, dual, lower, upper, q) -> (U, c, D, merit, dual, kkt) at the next U."""
     limits = problem.controller.limits
     nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
-    now, inputs, c, derivatives = (ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2))))
+    now, inputs, c, derivatives = (
+        ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2)))
+    )
     merit, dual, q = ca.MX.sym("merit"), ca.MX.sym("dual", _duals(problem)), ca.MX.sym("q", nq)
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
     *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper)
@@ -118,7 +120,14 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
 
 def _line_search(problem: Problem) -> ca.Function:
     """(now, U, d, length, allowed, q) -> (U, c, D, phi) at U + length d, the length halved while phi > allowed."""
-    sizes = {"now": problem.sweep.size1_in(0), "U": problem.size, "d": problem.size, "length": 1, "allowed": 1, "q": problem.prepare.size1_out(0)}
+    sizes = {
+        "now": problem.sweep.size1_in(0),
+        "U": problem.size,
+        "d": problem.size,
+        "length": 1,
+        "allowed": 1,
+        "q": problem.prepare.size1_out(0),
+    }
     arguments = [ca.MX.sym(name, rows) for name, rows in sizes.items()]
     now, base, direction, length, allowed, q = arguments
 

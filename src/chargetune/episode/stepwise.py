@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.controller import Controller
-from chargetune.control.mpc import act, begin
+from chargetune.control.mpc import Act, act, begin
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
 from chargetune.plants.plant import Measurement, Plant, PlantError
@@ -27,8 +27,11 @@ def run_episode(
     theta: ArrayLike | None = None,
     seed: int = 0,
     trips: Sequence[Trip] = (),
+    control: Act = act,
 ) -> Episode:
     """Run one closed loop step by step on any plant. It always returns: a failure is the episode's ending.
+
+    ``control`` is the control step, `ipopt_act` for the reference solver.
 
     The plant is closed at the end, whatever happened, and before anything else is done with the result. What the plant
     raises ends the episode as PLANT, what the controller raises as SOLVER; the intervals until then are kept. A plant
@@ -48,7 +51,8 @@ def run_episode(
         message = tripped(plant, first, trips)
         ending = Ending.LIMIT if message else Ending.DONE
         for _ in range(0 if message else steps):
-            u, memory, info = act(controller, measurement.received[indices], values, memory)
+            u, memory, info = control(controller, measurement.received[indices], values, memory)
+            _refuse_unusable(u, len(plant.inputs))
             measurement = _asked(plant, partial(plant.step, u))
             records.append((u, measurement, info.status, info.kkt, info.iterations, info.estimate))
             blind = blind + 1 if not np.all(np.isfinite(measurement.end)) else 0
@@ -84,6 +88,12 @@ def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
         if shape != expected:
             raise PlantError(f"the plant's measurement {name} has shape {shape}, expected {expected}")
     return measurement
+
+
+def _refuse_unusable(u: NDArray[np.float64], count: int) -> None:
+    # `act` never gives such an input; another control step may, and a plant must not get it.
+    if np.shape(u) != (count,) or not np.all(np.isfinite(u)):
+        raise ValueError(f"input = {np.asarray(u).tolist()}, allowed are {count} finite numbers")
 
 
 def _closed(plant: Plant) -> str:

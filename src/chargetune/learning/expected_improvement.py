@@ -54,7 +54,9 @@ class ExpectedImprovement:
         if len(first) == n:
             return first
         done = [t for t in trials if t.score is not None]
-        failed = space.to_unit(np.array([t.theta for t in trials if t.score is None and t.status != "running"]).reshape(-1, space.dimension))
+        failed = space.to_unit(
+            np.array([t.theta for t in trials if t.score is None and t.status != "running"]).reshape(-1, space.dimension)
+        )
         pending = [space.to_unit(np.array(t.theta)) for t in trials if t.score is None and t.status == "running"]
         pending += list(space.to_unit(first))
         proposed: list[NDArray[np.float64]] = []

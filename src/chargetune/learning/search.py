@@ -52,7 +52,9 @@ def candidates(dimension: int, seed: int, around: torch.Tensor | None) -> torch.
 
 
 def maximise(
-    acquisition: AcquisitionFunction | Callable[[torch.Tensor], torch.Tensor], points: torch.Tensor, taken: Sequence[Sequence[float]] | NDArray[np.float64]
+    acquisition: AcquisitionFunction | Callable[[torch.Tensor], torch.Tensor],
+    points: torch.Tensor,
+    taken: Sequence[Sequence[float]] | NDArray[np.float64],
 ) -> torch.Tensor:
     """The best point found, shape (d,): the best ``points`` (m, d) improved by L-BFGS-B; never one of ``taken`` again."""
     with torch.no_grad():

@@ -69,7 +69,9 @@ class GaussianProcess:
                 # An iteration limit is no failure here, see FIT_ITERATIONS.
                 warnings.simplefilter("ignore")
                 fit_gpytorch_mll(
-                    ExactMarginalLogLikelihood(model.likelihood, model), optimizer_kwargs={"options": {"maxiter": FIT_ITERATIONS}}, max_attempts=2
+                    ExactMarginalLogLikelihood(model.likelihood, model),
+                    optimizer_kwargs={"options": {"maxiter": FIT_ITERATIONS}},
+                    max_attempts=2,
                 )
         except (ModelFittingError, NanError, NotPSDError, RuntimeError) as error:
             warnings.warn(f"the surrogate of {len(y)} trials could not be fitted ({error})", SurrogateWarning, stacklevel=2)

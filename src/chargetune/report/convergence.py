@@ -41,6 +41,7 @@ def convergence_figure(view: StudyView) -> Figure:
     """Upper panel: loss of each trial and the incumbent. Lower panel: worst excess, logarithmic beyond 1 unit of its axis."""
     with journal_style():
         from matplotlib.lines import Line2D
+        from matplotlib.ticker import MaxNLocator
 
         figure, (upper, lower) = new_figure(COLUMN_IN, 3.6, 2, 1, sharex=True)
         numbers = [t.number for t in view.trials]
@@ -52,9 +53,11 @@ def convergence_figure(view: StudyView) -> Figure:
             upper.plot(at, [loss(view, t) for t in trials], label=text, linestyle="none", **style)
             lower.plot(at, [scale * worst_excess(t) for t in trials], label=text, linestyle="none", **style)
         failed = [t.number for t in view.trials if t.status is TrialStatus.FAILED]
-        for axis in (upper, lower):
-            if failed:
-                _failed(axis, failed)
+        if failed:
+            # A failed trial has no value, so its mark stands at the foot of the axis.
+            upper.plot(
+                failed, [0.04] * len(failed), "x", color="black", markersize=4, transform=upper.get_xaxis_transform(), label="failed"
+            )
         handles = [Line2D([], [], linestyle="none", label=text, **style) for text, trials, style in marks if trials]
         if failed:
             handles.append(Line2D([], [], linestyle="none", marker="x", color="black", markersize=4, label="failed"))
@@ -65,6 +68,11 @@ def convergence_figure(view: StudyView) -> Figure:
         allowed = {v for t in view.trials if t.score is not None for v in t.score.tolerance.values()}
         if len(allowed) == 1 and allowed != {0.0}:
             handles.append(lower.axhline(scale * allowed.pop(), color=RED, linestyle=":", linewidth=0.8, label="tolerance"))
+        low, high = lower.get_ylim()
+        lower.set_ylim(min(-1.0, low), max(1.0, high))
+        lower.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if not any(trials for _, trials, _ in marks):
+            upper.set_yticks([])
         upper.set_ylabel(_loss_label(view))
         lower.set_ylabel(f"worst excess ({label})")
         lower.set_xlabel("trial")
@@ -89,17 +97,11 @@ def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:
         ("within limits", [t for t in scored if t.feasible], {"marker": "o", "color": GREEN, "markersize": 3.5}),
         ("violating", [t for t in scored if not t.feasible], {"marker": "^", "color": RED, "markersize": 3.5, "fillstyle": "none"}),
     ]
-    for label, trial, color in (("untuned", view.untuned, BLUE), (view.tuned_label, view.tuned, ORANGE)):
+    for label, trial, color, marker in (("untuned", view.untuned, BLUE, "s"), (view.tuned_label, view.tuned, ORANGE, "o")):
         if trial is not None and trial.score is not None:
-            ring = {"marker": "o", "color": color, "markersize": 8, "fillstyle": "none", "markeredgewidth": 1.4}
+            ring = {"marker": marker, "color": color, "markersize": 8, "fillstyle": "none", "markeredgewidth": 1.4}
             kinds.append((label, [trial], {**ring, "zorder": 4, "clip_on": False}))
     return kinds
-
-
-def _failed(axis: Axes, numbers: list[int]) -> None:
-    # A failed trial has no value, so its mark stands at the foot of the axis.
-    at = axis.get_xaxis_transform()
-    axis.plot(numbers, [0.04] * len(numbers), "x", color="black", markersize=4, transform=at, label="failed")
 
 
 def _loss_label(view: StudyView) -> str:
@@ -111,6 +113,6 @@ def _loss_label(view: StudyView) -> str:
 def _excess_unit(view: StudyView) -> tuple[str, float]:
     """Unit of the lower panel and the factor to it: millivolts when every limit is a voltage."""
     limits = {name for t in view.trials if t.score is not None for name in t.score.excess}
-    if limits and all(name.endswith("_V") for name in limits):
+    if (limits or view.problem is not None) and all(name.endswith("_V") for name in limits):
         return "mV", 1e3
     return "unit of the limit", 1.0

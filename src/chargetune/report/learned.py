@@ -61,10 +61,10 @@ def backoff_figure(view: StudyView) -> Figure:
         handles = _grey(axis, [1e3 * backoff_values(problem.backoff, t.theta[part]) for t in view.others])
         for label, color in (("untuned", BLUE), ("tuned", ORANGE)):
             if label in drawn:
-                text = view.tuned_label if label == "tuned" else label
-                handles += axis.plot(100 * SOC, drawn[label], color=color, label=text, zorder=3)
+                text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
+                handles += axis.plot(100 * SOC, drawn[label], color=color, linestyle=dashes, label=text, zorder=3)
                 axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
-        if "tuned" not in drawn:
+        if not np.ptp(list(drawn.values())):
             # b = 0 alone spans no range; that of the trials says what was tried.
             axis.set_ylim(1e3 * problem.backoff.lower_V - 10, 1e3 * problem.backoff.upper_V + 10)
         beside = axis.twinx()
@@ -90,8 +90,9 @@ def resistance_figure(view: StudyView, of: Literal["R0", "R1"]) -> Figure:
         nodes = {"plant": true, **{label: believed * theta[part] for label, theta in _thetas(view).items()}}
         for label, color, marker in (("plant", GREEN, "s"), ("untuned", BLUE, "o"), ("tuned", ORANGE, "o")):
             if label in nodes:
-                text = view.tuned_label if label == "tuned" else label
-                handles += axis.plot(100 * SOC, 1e3 * resistance_values(problem, nodes[label]), color=color, label=text, zorder=3)
+                text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
+                values = 1e3 * resistance_values(problem, nodes[label])
+                handles += axis.plot(100 * SOC, values, color=color, linestyle=dashes, label=text, zorder=3)
                 axis.plot(100 * np.array(problem.plant_cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
         axis.set_ylim(bottom=0.0)
         axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")

@@ -52,6 +52,11 @@ class StudyView:
         return "tuned" if self.tuned is None or self.tuned.feasible else "tuned, violating"
 
     @property
+    def tuned_dashes(self) -> str:
+        """Line style of the tuned run: dashed when it is the untuned one too, which then shows through."""
+        return "--" if self.tuned is not None and self.tuned is self.untuned else "-"
+
+    @property
     def others(self) -> tuple[Trial, ...]:
         """Told trials that are neither the untuned nor the tuned one, the failed ones included."""
         apart = [t.number for t in (self.untuned, self.tuned) if t is not None]

@@ -27,6 +27,7 @@ BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#B8000B", "#8
 # Widths of one column and of a page's text block, inches.
 COLUMN_IN, PAGE_IN = 3.5, 7.0
 FORMATS = ("png", "pdf", "svg")
+DPI = 300
 
 RC: dict[str, Any] = {
     "font.size": 8,
@@ -48,7 +49,7 @@ RC: dict[str, Any] = {
     "legend.handletextpad": 0.5,
     "figure.constrained_layout.h_pad": 0.03,
     "figure.constrained_layout.w_pad": 0.03,
-    "savefig.dpi": 300,
+    "savefig.dpi": DPI,
     # TrueType fonts, which journals ask for; and identifiers that do not change from run to run.
     "pdf.fonttype": 42,
     "svg.hashsalt": "chargetune",
@@ -121,5 +122,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     if kind not in FORMATS:
         raise ValueError(f"figure {target}: format {kind!r}, allowed are {', '.join(FORMATS)}")
     with journal_style():
+        # The layout depends on the resolution and on the layout before, so it is settled once, at the same one for every format.
+        figure.set_dpi(DPI)
+        figure.canvas.draw()
+        figure.set_layout_engine("none")
         figure.savefig(target, format=kind, metadata=METADATA[kind])
     return target

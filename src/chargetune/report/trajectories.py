@@ -67,10 +67,10 @@ def trajectories_figure(view: StudyView) -> Figure:
                 continue
             drawn = curves(episode)
             shown.append(drawn["voltage_V"][1])
-            text = f"{label} (trial {trial.number})" if trial is tuned else label
+            text, dashes = (label, "-") if color == BLUE else (f"{label} (trial {trial.number})", view.tuned_dashes)
             for name, axis in panels.items():
                 signal, width = ("voltage_V", 0.7) if name == "near" else (name, 1.2)
-                axis.plot(*drawn[signal], color=color, linewidth=width, label=text, zorder=3)
+                axis.plot(*drawn[signal], color=color, linewidth=width, linestyle=dashes, label=text, zorder=3)
             handles.append(panels["soc"].lines[-1])
         if tuned is None:
             handles.append(words("tuned: none"))

@@ -1,0 +1,58 @@
+"""Every reference trajectory of the case study, by each way to run the loop."""
+
+import json
+
+import numpy as np
+import pytest
+
+from chargetune.battery.cell import default_cell
+from chargetune.battery.charging import Backoff, ChargingProblem
+from chargetune.control.ipopt import ipopt_act
+from chargetune.episode.compiled import simulate
+from chargetune.episode.stepwise import run_episode
+
+NAMES = [
+    *("oracle", "seed0", "seed1", "seed2", "seed3", "seed4", "seed5", "seed0-backoff", "seed1-backoff", "seed2-backoff"),
+    *(f"seed{s}-model-U1" for s in range(6)),
+]
+WAYS = {
+    "compiled": lambda problem, theta: simulate(problem.controller, problem.plant, steps=360, theta=theta, compiled=True),
+    "virtual machine": lambda problem, theta: simulate(problem.controller, problem.plant, steps=360, theta=theta, compiled=False),
+    "step by step": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta),
+    "IPOPT": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta, control=ipopt_act),
+}
+
+
+@pytest.fixture(scope="module")
+def cases(shared):
+    return {case["name"]: case for case in json.loads((shared / "reference" / "p0.json").read_text())["cases"]}
+
+
+def problem_of_case(case):
+    seed = None if case["name"] == "oracle" else int(case["name"][4])
+    treatment = "exact" if case["U1"] == "measured" else "model"
+    return ChargingProblem(default_cell(), mismatch_seed=seed, backoff=Backoff(7), overpotential=treatment, c1=1e-4)
+
+
+def test_no_case_is_forgotten(cases):
+    assert sorted(cases) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", NAMES)
+def test_trajectory(name, way, cases):
+    case = cases[name]
+    problem = problem_of_case(case)
+    for key in ("R0_ohm", "R1_ohm", "C1_F"):
+        np.testing.assert_allclose(getattr(problem.controller_cell, key), case["controller"][key], rtol=1e-12)
+    episode = WAYS[way](problem, case["backoff_V"])
+    start, end = episode.signal("voltage_V")
+    _, soc = episode.signal("soc")
+    np.testing.assert_allclose(episode.input[:, 0], case["current"], atol=0.010)
+    np.testing.assert_allclose(start, case["voltage_start"], atol=1e-3)
+    np.testing.assert_allclose(end, case["voltage_end"], atol=1e-3)
+    np.testing.assert_allclose([0.05, *soc], case["soc"], atol=1e-4)
+    assert episode.failures == 0
+    score = problem.score(episode)
+    assert score.performance == pytest.approx(case["G_c1_1e4"], rel=5e-3)
+    assert score.metrics["overshoot_mV"] == pytest.approx(case["max_overshoot_mV"], abs=0.5)
