@@ -102,8 +102,8 @@ def test_solution_is_that_of_ipopt(slot, seed):
         cost, rows, _ = problem.sweep(now, u, q)
         return float(problem.merit(cost, rows))
 
-    # With soft limits the minimiser may be flat; the merit tells, and the first input is what is applied.
-    assert merit(np.array(solution).ravel()) <= merit(reference) + 1e-6 * (1 + abs(merit(reference)))
+    # What the tolerance leaves of a violation, 1e-4 of a scale of 0.1, costs 1e3 a unit in each of three limits.
+    assert merit(np.array(solution).ravel()) <= merit(reference) + 3 * KKT_TOLERANCE * 0.1 * 1e3
     assert float(solution[0]) == pytest.approx(reference[0], abs=2e-3)
 
 
@@ -220,9 +220,21 @@ def test_penalty_is_exact_above_the_multipliers_and_visible_below():
 
 def test_an_impossible_limit_is_broken_as_little_as_possible():
     own = controller("l", limits=[SoftLimit("position", upper=-1.0, at="end", penalty=1e4, scale=0.1)])
-    episode = simulate(own, SimulatedPlant(model(), {}), steps=10)
+    episode = simulate(own, SimulatedPlant(model(), {}), steps=60)
     assert episode.failures == 0
-    np.testing.assert_allclose(episode.input, -0.9, atol=1e-3)
+    assert np.all(episode.input >= -0.9)
+    # The cost pulls to +1, the limit is -1: it goes there as far as the force can push.
+    position = episode.signal("position")[1]
+    assert np.all(np.diff(position) <= 1e-6)
+    assert position[-1] < -0.9
+
+
+def test_a_state_beyond_its_limit_comes_back_although_the_cost_pulls_outwards():
+    """Only the growing weights of later violations do this: with equal ones the whole horizon may be as bad as its start."""
+    own = controller("l", limits=[SoftLimit("position", upper=0.2, at="end", penalty=1e3, scale=0.1)])
+    episode = simulate(own, SimulatedPlant(model(), {"position": 0.6}), steps=60)
+    assert episode.failures == 0
+    assert episode.signal("position")[1][-1] < 0.21
 
 
 @pytest.mark.parametrize("horizon", [1, 50])

@@ -53,7 +53,7 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     result = summarise(out, case, name, rows, trials)
     for target in (out / "claims.json", out / f"claims-{case}-{tuner}.json"):
         target.write_text(json.dumps(result, indent=1))
-    figures = save_figures(path, case_study(case, numbers[0], name).study.name, out / f"{case}-{tuner}-seed{numbers[0]}")
+    figures = save_figures(path, case_study(case, numbers[0], name).study.name, out / f"{case}-{tuner}-seed{numbers[0]}", trials=trials)
     seeds_figure(rows, out / f"{case}-{tuner}-seeds.png")
     if as_json:
         print(json.dumps(result))  # noqa: T201

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import Config, load_config
 from chargetune.battery.reproduce import open_study, tuned_trial
 from chargetune.cli.output import console, metrics_table, number, theta_lines
@@ -72,13 +73,18 @@ def tune_command(
     if out is not None:
         from chargetune.report import save_figures
 
-        figures = save_figures(kept, config.study.name, out)
+        figures = save_figures(kept, config.study.name, out, trials=count)
     summary = _summary(config, everything, best, problem.space.entries)
     if out is not None:
         (out / "summary.json").write_text(json.dumps(summary, indent=1))
     if as_json:
         print(json.dumps(summary))  # noqa: T201
         return
+    _closing(problem, everything, best)
+    console().print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+
+
+def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | None) -> None:
     screen = console()
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
@@ -92,7 +98,6 @@ def tune_command(
     if best is not None:
         units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
         screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
-    screen.print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
 
 
 def _summary(config: Config, trials: list[Trial], best: Trial | None, names: tuple[str, ...]) -> dict[str, Any]:

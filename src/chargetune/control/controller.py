@@ -57,8 +57,8 @@ class SoftLimit:
         Where in the interval outputs are limited: h(x_i, u_i), h(x_{i+1}, u_i), both, or only at the end of the horizon.
         A state is limited at ``end`` or ``terminal``, since x_0 is given.
     penalty
-        Cost per unit of the largest violation over the horizon. The penalty is exact (no violation where none is
-        needed) when it exceeds the sum of the limit's multipliers.
+        Cost per unit of the largest violation over the horizon, weighted 1 at its start to 2 at its end. The penalty is
+        exact (no violation where none is needed) when it exceeds the sum of the limit's multipliers.
     scale
         A noticeable violation, in the unit of the limit; the solver's tolerance is relative to it.
     """

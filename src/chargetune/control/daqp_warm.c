@@ -12,6 +12,7 @@
  */
 #include <daqp/api.h>
 #include <daqp/utils.h>
+#include <float.h>
 #include <math.h>
 #include <string.h>
 
@@ -55,6 +56,16 @@ static void start_from(DAQPWorkspace *work, const double *guess) {
   }
 }
 
+/* DAQP does not survive numbers that are none; bounds may be infinite. */
+static int usable(const double **arg) {
+  int i, bad = 0;
+  for (i = 0; i < VARS * VARS; ++i) bad |= !(fabs(arg[0][i]) <= DBL_MAX);
+  for (i = 0; i < VARS; ++i) bad |= !(fabs(arg[1][i]) <= DBL_MAX) | (arg[4][i] != arg[4][i]) | (arg[5][i] != arg[5][i]);
+  for (i = 0; i < QP_M * VARS; ++i) bad |= !(fabs(arg[2][i]) <= DBL_MAX);
+  for (i = 0; i < QP_M; ++i) bad |= !(fabs(arg[3][i]) <= DBL_MAX);
+  return !bad;
+}
+
 int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem) {
   double a[QP_M * VARS + 1], lower[CONS], upper[CONS];
   double rinv[(VARS + 1) * VARS / 2], m[QP_M * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
@@ -69,6 +80,11 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
   (void)w;
   (void)mem;
 
+  if (!usable(arg)) {
+    for (i = 0; i < VARS && res[0]; ++i) res[0][i] = NAN;
+    for (i = 0; i < CONS && res[1]; ++i) res[1][i] = NAN;
+    return 0;
+  }
   memset(&work, 0, sizeof work);
   daqp_default_settings(&settings);
   settings.primal_tol = QP_TOLERANCE;

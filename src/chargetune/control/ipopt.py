@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from chargetune.control.controller import Controller
 from chargetune.control.mpc import Info, Memory, cached, problem_of
+from chargetune.control.ocp import row_weight
 from chargetune.control.sqp import SolveStatus
 
 __all__ = ["Nlp", "ipopt_act", "multiple_shooting"]
 
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 500, "bound_relax_factor": 0.0},
     "print_time": False,
     "error_on_fail": False,
@@ -39,7 +40,7 @@ class Nlp:
 
 
 def multiple_shooting(controller: Controller) -> Nlp:
-    """min J + sum_j w_j (s_j + s_j^2 / (2 scale_j)) s.t. x_{i+1} = f(x_i, u_i), rows <= s, bounds on u, s >= 0."""
+    """min J + sum_j w_j (s_j + s_j^2 / (2 scale_j)) s.t. x_{i+1} = f(x_i, u_i), (1 + i / N) rows <= s, bounds on u, s >= 0."""
     model, horizon = controller.model, controller.horizon
     nx, nu = len(model.states), len(model.inputs)
     now, theta = ca.MX.sym("now", nx), ca.MX.sym("theta", controller.theta.dimension)
@@ -51,20 +52,21 @@ def multiple_shooting(controller: Controller) -> Nlp:
     gaps: list[Any] = []
     rows: list[Any] = []
 
-    def add_rows(places: tuple[str, ...], x: Any, u: Any) -> None:
-        rows.extend(limit.rows(x, u, theta, p, now) - slack[j] for j, limit in enumerate(controller.limits) if limit.at in places)
+    def add_rows(places: tuple[str, ...], stage: int, x: Any, u: Any) -> None:
+        weight = row_weight(stage, horizon)
+        rows.extend(weight * limit.rows(x, u, theta, p, now) - slack[j] for j, limit in enumerate(controller.limits) if limit.at in places)
 
     x: Any = now
     for i in range(horizon):
         u = inputs[:, i]
         cost += controller.stage_cost(x, u, theta, p, setpoint, now)
-        add_rows(("start", "both"), x, u)
+        add_rows(("start", "both"), i, x, u)
         gaps.append(states[:, i] - model.f(x, u, p))
         x = states[:, i]
-        add_rows(("end", "both"), x, u)
+        add_rows(("end", "both"), i, x, u)
     no_input = ca.MX(ca.DM.zeros(nu))
     cost += controller.terminal_cost(x, no_input, theta, p, setpoint, now)
-    add_rows(("terminal",), x, no_input)
+    add_rows(("terminal",), horizon, x, no_input)
     for j, limit in enumerate(controller.limits):
         cost += limit.penalty * (slack[j] + slack[j] ** 2 / (2 * limit.scale))
 

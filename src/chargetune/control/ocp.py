@@ -16,7 +16,7 @@ import numpy as np
 from chargetune.control.controller import Controller
 from chargetune.control.estimators import finite
 
-__all__ = ["Problem", "control_problem"]
+__all__ = ["Problem", "control_problem", "row_weight"]
 
 # Least curvature of an input relative to the mean; only the steps depend on it, not the solution.
 REGULARISATION = 1e-8
@@ -32,7 +32,7 @@ class Problem:
     bounds
         (now, q) -> (lower, upper), the input bounds repeated over the horizon, shapes (N nu,).
     sweep
-        (now, U, q) -> (J, c, D): cost, scaled rows c(U) <= s, and the stages' derivatives packed in a vector.
+        (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
     quadratic
         (U, c, D, lower, upper) -> (H, g, A, uba, lbx, ubx, span, gamma): the scaled QP, with dU = span v, cost gamma J.
     residual
@@ -75,6 +75,15 @@ class Problem:
         return sum(limit.rows.size1_out(0) * (2 if limit.at == "both" else 1) for limit in self.controller.limits if limit.at != "terminal")
 
 
+def row_weight(stage: int, horizon: int) -> float:
+    """Weight of a violation at stage i in the slack s = max_i (1 + i / N) c_i.
+
+    With equal weights a violation that cannot be avoided now would make all later ones as large free of charge, and a
+    state once beyond its limit would stay there. Growing weights ask for half of it by the end of the horizon.
+    """
+    return 1.0 + stage / horizon
+
+
 def control_problem(controller: Controller) -> Problem:
     """Turn a controller into CasADi functions."""
     model, horizon, limits = controller.model, controller.horizon, controller.limits
@@ -114,10 +123,13 @@ def control_problem(controller: Controller) -> Problem:
     prepared = ca.cse(ca.vertcat(*values)) if values else ca.SX(0, 1)
     after, stage_cost, stage_rows, final_cost, final_rows, lower, upper, fallback, x_hat, corrected, predicted = expressions
 
+    weight = ca.SX.sym("weight")
+    stage_rows = stage_rows * weight
+    final_rows = final_rows * row_weight(horizon, horizon)
     stage = _Linearisation.of(x, u, after, stage_cost, stage_rows)
     final = _Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
     groups = (*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal"))
-    packed_stage = ca.Function("stage", [x, u, now, q], _cse(after, stage_cost, stage_rows, stage.packed))
+    packed_stage = ca.Function("stage", [x, u, now, q, weight], _cse(after, stage_cost, stage_rows, stage.packed))
     packed_final = ca.Function("final", [x, now, q], _cse(final_cost, final_rows, final.packed))
     return Problem(
         controller=controller,
@@ -177,8 +189,8 @@ class _Linearisation:
 def _sweep(stage: ca.Function, final: ca.Function, horizon: int, nx: int, nu: int, nq: int) -> ca.Function:
     now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", nq)
     x, cost, rows, derivatives = now, ca.MX(0.0), [], []
-    for u in ca.vertsplit(inputs, nu):
-        x, stage_cost, row, packed = stage(x, u, now, q)
+    for i, u in enumerate(ca.vertsplit(inputs, nu)):
+        x, stage_cost, row, packed = stage(x, u, now, q, row_weight(i, horizon))
         cost = cost + stage_cost
         rows.append(row)
         derivatives.append(packed)

@@ -1,13 +1,13 @@
 """The MPC's solver: Gauss-Newton SQP with an exact-penalty line search, one CasADi function for a whole control step.
 
     min over U, s >= 0   phi = J(U) + sum_j w_j (s_j + s_j^2 / (2 scale_j))
-    s.t.                 lower <= U <= upper,   c_i(U) <= s_j(i)
+    s.t.                 lower <= U <= upper,   (1 + i / N) c_i(U) <= s_j
 
-with one slack s_j for each limit over the whole horizon. Each iteration solves the QP of the linearised outputs and
-the stage costs' Hessians (curvature of the dynamics left out, gradient exact) with DAQP and goes the full step; while
-phi rises the step is halved. The first iterate is the shifted solution of the control step before. After each
-iteration the problem is linearised anew and optimality and feasibility are measured THERE, from multipliers and
-derivatives, independently of what the QP solver reports: a QP solver that is silently wrong cannot pass.
+with one slack s_j for each limit over the whole horizon, c_i its value less its bound at stage i. Each iteration solves
+the QP of the linearised outputs and the stage costs' Hessians (curvature of the dynamics left out, gradient exact) with
+DAQP and goes the full step; while phi rises the step is halved. The first iterate is the shifted solution of the control
+step before. After each iteration the problem is linearised anew and optimality and feasibility are measured THERE, from
+multipliers and derivatives, independently of what the QP solver reports: one that is silently wrong cannot pass.
 """
 
 from __future__ import annotations
