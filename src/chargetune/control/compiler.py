@@ -60,7 +60,7 @@ def compile_library(name: str, sources: tuple[str, ...], defines: tuple[str, ...
         raise RuntimeError("no C compiler found; set CHARGETUNE_CC or use the virtual machine (compiled=False)")
     base = Path(ca.__file__).parent
     options = [*FLAGS, *(f"-D{d}" for d in defines), f"-I{base / 'include'}", f"-L{base}", f"-Wl,-rpath,{base}"]
-    content = "\0".join([*sources, *options, compiler, ca.__version__, _processor()])
+    content = "\0".join([*sources, *options, compiler, ca.CasadiMeta.version(), _processor()])
     target = cache_folder() / f"{name}-{hashlib.sha256(content.encode()).hexdigest()[:24]}.so"
     if target.exists():
         return target

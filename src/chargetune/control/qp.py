@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.resources import files
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -33,7 +34,7 @@ def daqp(variables: int, rows: int) -> ca.Function:
     uba, lbx, ubx = ca.MX.sym("uba", rows), ca.MX.sym("lbx", variables), ca.MX.sym("ubx", variables)
     guess = ca.MX.sym("guess", variables + rows)
     # Without CasADi's check of the data, which raises on NaN: a control step answers with its fallback instead.
-    options = {"error_on_fail": False, "inputs_check": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
+    options: dict[str, Any] = {"error_on_fail": False, "inputs_check": False, "daqp": {"primal_tol": PRIMAL_TOLERANCE}}
     qp = ca.conic("qp", "daqp", {"h": h.sparsity(), "a": a.sparsity()}, options)
     solution = qp(h=h, g=g, a=a, lba=-np.inf, uba=uba, lbx=lbx, ubx=ubx)
     return ca.Function("daqp", [h, g, a, uba, lbx, ubx, guess], [solution["x"], ca.vertcat(solution["lam_x"], solution["lam_a"])])

@@ -138,7 +138,7 @@ def _line_search(problem: Problem) -> ca.Function:
     for _ in range(HALVINGS_MAX):
         kept = [ca.MX.sym("kept", *t.shape) for t in trial]
         keep = ca.Function("keep", [*arguments, *kept], kept)
-        shorter = ca.Function("shorter", [*arguments, *kept], search(now, base, direction, length / 2, allowed, q))
+        shorter = ca.Function("shorter", [*arguments, *kept], list(search(now, base, direction, length / 2, allowed, q)))
         branch = ca.Function.if_else("halve", shorter, keep)
-        search = ca.Function("search", arguments, branch(ca.logic_not(trial[-1] <= allowed), *arguments, *trial))
+        search = ca.Function("search", arguments, list(branch(ca.logic_not(trial[-1] <= allowed), *arguments, *trial)))
     return search

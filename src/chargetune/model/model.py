@@ -79,10 +79,7 @@ class Model:
     def __post_init__(self) -> None:
         if not _positive(self.sampling_time_s):
             raise ValueError(f"model {self.name}: sampling_time_s = {self.sampling_time_s!r}, allowed is a finite number > 0")
-        for field, minimum in (("states", 1), ("inputs", 1), ("outputs", 0)):
-            names = [s.name for s in getattr(self, field)]
-            if len(names) < minimum or len(set(names)) != len(names):
-                raise ValueError(f"model {self.name}: {field} = {names}, allowed are at least {minimum} different names")
+        _check_names(self.name, self.states, self.inputs, self.outputs)
         for name, values in self.parameters:
             if not all(math.isfinite(v) for v in values):
                 raise ValueError(f"model {self.name}: parameter {name} = {list(values)}, allowed are finite numbers")
@@ -104,6 +101,7 @@ class Model:
         ``equations(x, u, p)`` returns two mappings: next value of every state and value of every output.
         Raises ValueError when a state or output is missing or unknown.
         """
+        _check_names(name, states, inputs, outputs)
         blocks = {key: np.atleast_1d(np.asarray(value, dtype=float)) for key, value in parameters.items()}
         x = ca.SX.sym("x", len(states))
         u = ca.SX.sym("u", len(inputs))
@@ -158,6 +156,13 @@ class Model:
                 raise ValueError(f"model {self.name}: parameter {name} has shape {value.shape}, expected ({sizes[name]},)")
         merged = tuple((name, tuple(float(v) for v in new.get(name, np.array(values)))) for name, values in self.parameters)
         return Model(self.name, self.states, self.inputs, self.outputs, merged, self.sampling_time_s, self.f, self.h)
+
+
+def _check_names(model: str, states: Sequence[Signal], inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
+    for field, signals, minimum in (("states", states, 1), ("inputs", inputs, 1), ("outputs", outputs, 0)):
+        names = [s.name for s in signals]
+        if len(names) < minimum or len(set(names)) != len(names):
+            raise ValueError(f"model {model}: {field} = {names}, allowed are at least {minimum} different names")
 
 
 def _stack(values: Mapping[str, Any], signals: Sequence[Signal], where: str) -> Any:

@@ -117,7 +117,7 @@ class ParameterSpace:
             slack = 1e-9 * (high - low)
             if not math.isfinite(value) or not low - slack <= value <= high + slack:
                 raise ValueError(f"theta: {name} = {value:g}, allowed is [{low:g}, {high:g}] {unit}")
-        return np.clip(values, self.lower, self.upper)
+        return np.asarray(np.clip(values, self.lower, self.upper), dtype=np.float64)
 
     def from_dict(self, values: dict[str, float | Sequence[float]]) -> NDArray[np.float64]:
         """theta from named values (a parameter or a single entry); what is not named stays at its default."""
@@ -143,7 +143,7 @@ class ParameterSpace:
         low, high = self._transformed_bounds()
         t = low + np.asarray(unit, dtype=float) * (high - low)
         theta = np.where(self._log, np.exp(np.where(self._log, t, 0.0)), t)
-        return np.asarray(np.clip(theta, self.lower, self.upper))
+        return np.asarray(np.clip(theta, self.lower, self.upper), dtype=np.float64)
 
     @property
     def _log(self) -> NDArray[np.bool_]:
