@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 __all__ = ["cache_folder", "compile_library", "find_compiler"]
 
 # No -ffast-math: the checks for NaN and infinity must survive.
-FLAGS = ("-O2", "-march=native", "-fPIC", "-shared", "-fno-semantic-interposition", "-fno-math-errno", "-Wl,-Bsymbolic")
+FLAGS = ("-O3", "-fno-trapping-math", "-fno-signed-zeros", "-march=native", "-fPIC", "-shared", "-fno-semantic-interposition", "-fno-math-errno", "-Wl,-Bsymbolic")
 
 
 def find_compiler() -> str | None:

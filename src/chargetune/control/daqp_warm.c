@@ -21,6 +21,7 @@
 #define VARS QP_N
 #define CONS (QP_N + QP_M)
 #define UPDATE_ALL (UPDATE_Rinv + UPDATE_M + UPDATE_v + UPDATE_d + UPDATE_sense)
+#define UPDATE_ROWS (UPDATE_M + UPDATE_d + UPDATE_sense)
 
 long long JOIN(QP_NAME, _n_in)(void) { return 7; }
 long long JOIN(QP_NAME, _n_out)(void) { return 2; }
@@ -71,7 +72,7 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
   double rinv[(VARS + 1) * VARS / 2], m[QP_M * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
   double lam[VARS + 2], lam_star[VARS + 2], l[(VARS + 2) * (VARS + 3) / 2], d[VARS + 2], xldl[VARS + 2], zldl[VARS + 2];
   double x[VARS + 1], xold[VARS + 1], primal[VARS], dual[CONS], guess[CONS];
-  int sense[CONS], start[CONS], origin[QP_M + 1], used[QP_M + 1], working[VARS + 2], kept = 0, added, i, j;
+  int sense[CONS], start[CONS], origin[QP_M + 1], used[QP_M + 1], working[VARS + 2], kept = 0, added, mask, i, j;
   DAQPSettings settings;
   DAQPProblem qp;
   DAQPWorkspace work;
@@ -132,17 +133,19 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
     }
   }
 
+  mask = UPDATE_ALL;
   do {
     qp.m = work.m = VARS + kept;
-    for (i = 0; i < VARS + kept; ++i) scaling[i] = 1.0;
+    for (i = mask == UPDATE_ALL ? 0 : VARS; i < VARS + kept; ++i) scaling[i] = 1.0;
     for (i = 0; i < kept; ++i) {
       lower[VARS + i] = -DAQP_INF;
       upper[VARS + i] = arg[3][origin[i]];
     }
     memset(m, 0, kept * VARS * sizeof *m);
     reset_daqp_workspace(&work);
-    result.exitflag = update_ldp(UPDATE_ALL, &work);
+    result.exitflag = update_ldp(mask, &work);
     if (result.exitflag < 0) break;
+    mask = UPDATE_ROWS;
     start_from(&work, guess);
     if (work.sing_ind != EMPTY_IND) {
       /* Dependent guesses: start from nothing. */

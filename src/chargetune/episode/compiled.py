@@ -38,20 +38,33 @@ class CompiledEpisode:
     function: ca.Function
     prepare_plant: ca.Function
 
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Columns of the recorded matrix: state, input, true and measured outputs at both ends, estimate, (status, kkt, iterations)."""
+        nx, nu, ny = len(self.plant.model.states), len(self.plant.inputs), len(self.plant.outputs)
+        return nx, nu, ny, ny, ny, ny, len(self.controller.model.states), 3
+
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
         """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
         controller, plant = self.controller, self.plant
         values = controller.theta_vector(theta)
         check_run(plant, self.steps, seed, trips)
+        memory = begin(controller)
+        q = problem_of(controller).prepare(values, controller.setpoint, controller.model.nominal)
         errors, process = disturbances(plant, self.steps, seed)
         _, _, resolution = plant.sensors.vectors(plant.outputs)
-        memory = begin(controller)
-        q = problem_of(controller).prepare(values, ca.DM(controller.setpoint), controller.model.nominal)
-        out = self.function(
-            plant.start_state, memory.estimator, memory.last_input, memory.warm, q, self.prepare_plant(plant.model.nominal), resolution,
-            errors[0, 1], errors[1:, 0].T, errors[1:, 1].T, process.T,
-        )  # fmt: skip
-        state, u, true_start, true_end, start, end, estimate, facts = (np.asarray(o.full() if hasattr(o, "full") else o).T for o in out)
+        start_state, plant_q = plant.start_state, self.prepare_plant(plant.model.nominal)
+        fixed = (start_state, memory.estimator, memory.last_input, memory.warm, q, plant_q, resolution, errors[0, 1])
+        given = np.concatenate([np.asarray(part, dtype=float).ravel() for part in fixed])
+        unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
+        recorded = np.empty((self.steps, sum(self.widths)))
+        # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.
+        buffer, evaluate = self.function.buffer()
+        buffer.set_arg(0, memoryview(given))
+        buffer.set_arg(1, memoryview(unknown))
+        buffer.set_res(0, memoryview(recorded))
+        evaluate()
+        state, u, true_start, true_end, start, end, estimate, facts = np.split(recorded, np.cumsum(self.widths)[:-1], axis=1)
         episode = Episode(
             sampling_time_s=plant.sampling_time_s,
             input_names=plant.model.input_names,
@@ -70,7 +83,7 @@ class CompiledEpisode:
             ending=Ending.DONE,
             true_start=true_start,
             true_end=true_end,
-            state=np.vstack([plant.start_state, state]),
+            state=np.vstack([start_state, state]),
         )
         at_rest = tripped(plant, replace(plant).reset(seed), trips) if trips else ""
         return episode.cut(0, Ending.LIMIT, at_rest) if at_rest else _until_not_finite(episode, trips)
@@ -165,21 +178,48 @@ def _built(
     after = transition(x, u, plant_q) + noise
     before_y, after_y = output(x, u, plant_q), output(after, u, plant_q)
     start, end = measure(before_y, error_start, resolution), measure(after_y, error_end, resolution)
-    step = ca.Function(
-        "step",
-        [x, memory, last, warm, sent, q, plant_q, resolution, error_start, error_end, noise],
-        [after, ahead, u, following, ca.vertcat(sent[ny:], end), before_y, after_y, start, end, estimate, ca.vertcat(status, kkt, count)],
-    )
-    loop = step.mapaccum("loop", steps, 5)
-    x0, y_error = ca.MX.sym("x0", nx), ca.MX.sym("e_rest", ny)
-    errors = [ca.MX.sym(n, k, steps) for n, k in (("E0", ny), ("E1", ny), ("W", nx))]
-    rest = measure(output(x0, ca.DM.zeros(len(plant.inputs)), plant_q), y_error, resolution)
-    fixed = [ca.repmat(v, 1, steps) for v in (q, plant_q, resolution)]
-    states, _, inputs, _, _, *recorded = loop(x0, memory, last, warm, ca.repmat(rest, delay + 1, 1), *fixed, *errors)
-    episode = ca.Function(
-        "episode", [x0, memory, last, warm, q, plant_q, resolution, y_error, *errors], [states, inputs, *recorded], {"cse": True}
-    )
-    return episode, prepare
+    carried, fixed = [x, memory, last, warm, sent], [q, plant_q, resolution]
+    unknown = ca.vertcat(error_start, error_end, noise)
+    unknowns = ca.MX.sym("unknown", unknown.shape[0])
+    step = ca.Function("plain_step", [*carried, *fixed, error_start, error_end, noise], [
+        after, ahead, u, following, ca.vertcat(sent[ny:], end),
+        ca.vertcat(after, u, before_y, after_y, start, end, estimate, status, kkt, count),
+    ])  # fmt: skip
+    parts = ca.vertsplit(unknowns, [0, ny, 2 * ny, 2 * ny + nx])
+    step = ca.Function("step", [*carried, *fixed, unknowns], list(step(*carried, *fixed, *parts)))
+
+    first = [x, memory, last, warm, q, plant_q, resolution, ca.MX.sym("e_rest", ny)]
+    given = ca.MX.sym("given", sum(v.shape[0] for v in first))
+    x0, memory0, last0, warm0, *fixed0, error = ca.vertsplit(given, np.cumsum([0, *(v.shape[0] for v in first)]).tolist())
+    rest = measure(output(x0, ca.DM.zeros(len(plant.inputs)), fixed0[1]), error, fixed0[2])
+    unknown_matrix = ca.MX.sym("unknown", unknown.shape[0], steps)
+    *_, recorded = _repeat(step, len(carried), steps)(x0, memory0, last0, warm0, ca.repmat(rest, delay + 1, 1), *fixed0, unknown_matrix)
+    return ca.Function("episode", [given, unknown_matrix], [recorded]), prepare
+
+
+# A function of so many calls is still compiled in a moment.
+CALLS_MAX = 20
+
+
+def _repeat(step: ca.Function, carried: int, count: int) -> ca.Function:
+    """``step`` count times: its first ``carried`` arguments come from its results, the last one and the last result have a column a step.
+
+    Unlike CasADi's mapaccum this hands on what is fixed by reference, instead of a copy for each step.
+    """
+    if count == 1:
+        return step
+    block = count if count <= CALLS_MAX else max(CALLS_MAX, int(np.ceil(np.sqrt(count))))
+    inner = step if block == count else _repeat(step, carried, block)
+    width = 1 if block == count else block
+    arguments = [ca.MX.sym("a", *step.size_in(i)) for i in range(step.n_in() - 1)]
+    columns = ca.MX.sym("columns", step.size1_in(step.n_in() - 1), count)
+    state, fixed, recorded = arguments[:carried], arguments[carried:], []
+    edges = [*range(0, count, width), count]
+    for part in ca.horzsplit(columns, edges):
+        function = inner if part.shape[1] == width else _repeat(step, carried, part.shape[1])
+        *state, record = function(*state, *fixed, part)
+        recorded.append(record)
+    return ca.Function(f"{step.name()}_{count}", [*arguments, columns], [*state, ca.horzcat(*recorded)])
 
 
 def _plant_functions(plant: SimulatedPlant) -> tuple[ca.Function, ca.Function, ca.Function]:
