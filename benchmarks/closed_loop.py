@@ -1,4 +1,4 @@
-"""How fast a closed loop is, beside do-mpc and plain CasADi with IPOPT, on problem P0: python benchmarks/closed_loop.py [--json]
+"""How fast a closed loop is on problem P0, beside do-mpc and plain CasADi with IPOPT. Run: python benchmarks/closed_loop.py [--json].
 
 P0 is the case study's hour of charging (360 steps, horizon 5, U1 measured) with the perfect model and five wrong ones.
 Everything is measured in one run, in rounds that alternate between the tools; figures are medians. An episode counts with
@@ -87,7 +87,8 @@ def batch():
     begin = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         done = [soc for part in pool.map(run_chunk, [own] * 8, np.array_split(thetas, 8)) for soc in part]
-    assert len(done) == len(thetas)
+    if len(done) != len(thetas):
+        raise RuntimeError(f"{len(done)} episodes came back, expected {len(thetas)}")
     return time.perf_counter() - begin
 
 

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -59,10 +60,11 @@ class CompiledEpisode:
         unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
         recorded = np.empty((self.steps, sum(self.widths)))
         # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.
+        buffer: Any
         buffer, evaluate = self.function.buffer()
-        buffer.set_arg(0, memoryview(given))
-        buffer.set_arg(1, memoryview(unknown))
-        buffer.set_res(0, memoryview(recorded))
+        buffer.set_arg(0, given.data)
+        buffer.set_arg(1, unknown.data)
+        buffer.set_res(0, recorded.data)
         evaluate()
         state, u, true_start, true_end, start, end, estimate, facts = np.split(recorded, np.cumsum(self.widths)[:-1], axis=1)
         episode = Episode(

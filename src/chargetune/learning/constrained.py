@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
-from botorch.acquisition import AcquisitionFunction, qLogExpectedImprovement
+from botorch.acquisition.acquisition import AcquisitionFunction
 from botorch.acquisition.analytic import LogConstrainedExpectedImprovement, LogProbabilityOfFeasibility
+from botorch.acquisition.logei import qLogExpectedImprovement
 from botorch.acquisition.objective import GenericMCObjective
-from botorch.models import ModelListGP
+from botorch.models.model_list_gp_regression import ModelListGP
 from botorch.sampling.normal import SobolQMCNormalSampler
 from numpy.typing import NDArray
 
@@ -143,7 +145,7 @@ class _Models:
         return cls(ModelListGP(*fitted), tuple(limit.bound for limit in limits), incumbent, best)
 
     def acquisition(self, waiting: torch.Tensor, seed: int) -> AcquisitionFunction:
-        constraints = {i + 1: (None, bound) for i, bound in enumerate(self.bounds)}
+        constraints: dict[int, tuple[float | None, float | None]] = {i + 1: (None, bound) for i, bound in enumerate(self.bounds)}
         if self.best is None and constraints:
             return _ProbabilityOfFeasibility(self.model, constraints)
         best = self.best if self.best is not None else float("-inf")
@@ -160,7 +162,7 @@ class _Models:
         )
 
 
-def _marginals(model: ModelListGP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and sd of each output at single points x (b, 1, d), shapes (b, m); the same as from ``model.posterior``.
 
     The surrogates are independent, so their joint covariance, which the general way builds, is not needed: 6 times quicker.
@@ -182,18 +184,18 @@ def _marginals(model: ModelListGP, x: torch.Tensor) -> tuple[torch.Tensor, torch
 class _ExpectedImprovement(LogConstrainedExpectedImprovement):
     """BoTorch's acquisition with `_marginals`."""
 
-    def _mean_and_sigma(self, X: torch.Tensor, compute_sigma: bool = True, min_var: float = 1e-12) -> tuple[torch.Tensor, torch.Tensor]:
+    def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
         return _marginals(self.model, X)
 
 
 class _ProbabilityOfFeasibility(LogProbabilityOfFeasibility):
     """BoTorch's acquisition with `_marginals`."""
 
-    def _mean_and_sigma(self, X: torch.Tensor, compute_sigma: bool = True, min_var: float = 1e-12) -> tuple[torch.Tensor, torch.Tensor]:
+    def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
         return _marginals(self.model, X)
 
 
-def _first(samples: torch.Tensor, X: torch.Tensor | None = None) -> torch.Tensor:
+def _first(samples: torch.Tensor, X: torch.Tensor | None = None) -> torch.Tensor:  # noqa: ARG001 - the signature BoTorch calls
     return samples[..., 0]
 
 

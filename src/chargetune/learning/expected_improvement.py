@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from botorch.acquisition import AcquisitionFunction, LogExpectedImprovement, qLogExpectedImprovement
+from botorch.acquisition.acquisition import AcquisitionFunction
+from botorch.acquisition.analytic import LogExpectedImprovement
+from botorch.acquisition.logei import qLogExpectedImprovement
 from botorch.sampling.normal import SobolQMCNormalSampler
 from numpy.typing import NDArray
-from torch.distributions import Normal
 
 from chargetune.learning.failures import AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
@@ -30,8 +32,9 @@ def expected_improvement(mean: torch.Tensor, sd: torch.Tensor, best: float) -> t
     same maximiser and does not underflow (Ament et al., NeurIPS 2023).
     """
     u = (mean - best) / sd
-    normal = Normal(torch.zeros_like(u), torch.ones_like(u))
-    return (mean - best) * normal.cdf(u) + sd * normal.log_prob(u).exp()
+    density = torch.exp(-(u**2) / 2) / math.sqrt(2 * math.pi)
+    improvement: torch.Tensor = (mean - best) * torch.special.ndtr(u) + sd * density
+    return improvement
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class ExpectedImprovement:
         with reproducible(seed):
             x = torch.as_tensor(space.to_unit(np.array([t.theta for t in done]).reshape(-1, space.dimension)))
             g = torch.tensor([t.score.performance for t in done if t.score is not None])
-            model = self.surrogate.fit(x, g) if len(done) else None
+            model = self.surrogate.fit(x, g) if done else None
             for k in range(n - len(first)):
                 points = candidates(space.dimension, seed + 7919 * (k + 1), x[g.argmax()] if model else None)
                 if model is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from botorch.acquisition import AcquisitionFunction
+from botorch.acquisition.acquisition import AcquisitionFunction
 from botorch.utils.transforms import t_batch_mode_transform
 
 __all__ = ["AwayFromFailures"]
@@ -21,14 +21,15 @@ class AwayFromFailures(AcquisitionFunction):
     def __init__(self, base: AcquisitionFunction, failed: torch.Tensor) -> None:
         super().__init__(model=base.model)
         self.base = base
-        self.register_buffer("failed", failed)
+        self.failed = failed
 
-    @t_batch_mode_transform(assert_output_shape=False)
+    @t_batch_mode_transform(assert_output_shape=False)  # type: ignore[arg-type] # it types self as the base class
     def forward(self, X: torch.Tensor) -> torch.Tensor:
         """X (b, q, d) -> (b,)."""
-        value = self.base(X)
+        value: torch.Tensor = self.base(X)
         if not len(self.failed):
             return value
         radius = RADIUS * X.shape[-1] ** 0.5
         distance = (X[..., None, :] - self.failed).square().sum(-1) / (2 * radius**2)
-        return value + torch.log(-torch.expm1(-distance - 1e-12)).sum(-1).amin(-1)
+        success: torch.Tensor = torch.log(-torch.expm1(-distance - 1e-12)).sum(-1).amin(-1)
+        return value + success

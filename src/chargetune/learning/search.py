@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import torch
-from botorch.acquisition import AcquisitionFunction
-from botorch.optim import optimize_acqf
+from botorch.acquisition.acquisition import AcquisitionFunction
+from botorch.optim.optimize import optimize_acqf
 from numpy.typing import NDArray
 
 from chargetune.learning.tuner import sobol_points
@@ -29,7 +29,9 @@ DUPLICATE = 1e-6
 def reproducible(seed: int) -> Iterator[None]:
     """Torch's random numbers from ``seed``, one thread, double precision; all as before afterwards."""
     threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
+        # linear_operator's own use of torch, which its users cannot change.
+        warnings.filterwarnings("ignore", "TypedStorage is deprecated|.*[Ss]parse", UserWarning)
         torch.manual_seed(seed)
         # For matrices of a hundred rows more threads cost time, and their sums depend on how many there are.
         torch.set_num_threads(1)
@@ -52,7 +54,7 @@ def candidates(dimension: int, seed: int, around: torch.Tensor | None) -> torch.
 
 
 def maximise(
-    acquisition: AcquisitionFunction | Callable[[torch.Tensor], torch.Tensor],
+    acquisition: AcquisitionFunction,
     points: torch.Tensor,
     taken: Sequence[Sequence[float]] | NDArray[np.float64],
 ) -> torch.Tensor:
@@ -71,7 +73,7 @@ def maximise(
                 acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=STARTS, batch_initial_conditions=start,
                 options={"maxiter": ITERATIONS},
             )  # fmt: skip
-        if torch.isfinite(value).all() and torch.isfinite(found).all():
+        if value is not None and torch.isfinite(value).all() and torch.isfinite(found).all():
             best = found[0]
     except (RuntimeError, ValueError):
         # A flat or ill-conditioned acquisition: the best candidate stands.

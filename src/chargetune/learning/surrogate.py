@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import gpytorch
 import torch
@@ -111,6 +112,7 @@ class GaussianProcess:
 
 def posterior(model: SingleTaskGP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean (m,) and covariance (m, m) of f at x (m, d), without noise, in the unit of y."""
-    with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
-        found = model.posterior(x)
+    exact = gpytorch.settings.fast_computations(covar_root_decomposition=False, log_prob=False, solves=False)
+    with torch.no_grad(), exact:
+        found: Any = model.posterior(x)
         return found.mean[:, 0], found.distribution.covariance_matrix

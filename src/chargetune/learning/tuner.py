@@ -49,7 +49,8 @@ def sobol_points(dimension: int, seed: int, first: int, n: int) -> NDArray[np.fl
     """Points ``first`` .. ``first + n - 1`` of the scrambled Sobol sequence in the unit cube, shape (n, d)."""
     sequence = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed))
     # Drawn up to the next power of two, which is how a Sobol sequence is balanced, and cut.
-    return sequence.random_base2((first + n - 1).bit_length())[first : first + n]
+    points: NDArray[np.float64] = sequence.random_base2((first + n - 1).bit_length())
+    return points[first : first + n]
 
 
 def initial_design(space: ParameterSpace, n_initial: int, seed: int, told: int, n: int) -> NDArray[np.float64]:
