@@ -6,13 +6,9 @@ default tuner with a limit told in five windows, as in charging, and the paper's
 
 import argparse
 import json
-import os
 import statistics
 import time
 from types import SimpleNamespace
-
-for library in ("OMP", "OPENBLAS", "MKL"):
-    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -35,7 +31,7 @@ def trials(dimension, count, windows, seed):
         parts = [float(np.max(0.35 - part)) for part in np.array_split(theta, windows)]
         score = Score(
             objective=-float(np.mean(theta**2)),
-            performance=-float(np.mean(theta**2)) - max(0.0, max(parts)),
+            performance=-float(np.mean(theta**2)) - max(0.0, *parts),
             excess={"limit": 0.1 * max(parts)},
             tolerance={"limit": 1e-3},
             profile={"limit": tuple(0.1 * p for p in parts)} if windows > 1 else {},
