@@ -1,7 +1,7 @@
 """The same closed loop (problem P0) by do-mpc and by CasADi's IPOPT, as their users would write it, warm-started and quiet.
 
 Both get chargetune's own model functions (explicit piecewise cubics), constrain the voltage at both ends of an interval
-softly, and step the same plant.
+softly, from below and above, and step the same plant.
 """
 
 import time
@@ -12,7 +12,7 @@ import numpy as np
 
 from chargetune.battery.ecm import ecm_model
 
-LIMIT_V, CURRENT_MAX_A, PENALTY = 4.2, 6.0, 1e3
+LOWEST_V, LIMIT_V, CURRENT_MAX_A, PENALTY = 2.5, 4.2, 6.0, 1e3
 
 
 def do_mpc_loop(problem, steps):
@@ -41,7 +41,8 @@ def do_mpc_loop(problem, steps):
     mpc.bounds["lower", "_u", "i"] = 0.0
     mpc.bounds["upper", "_u", "i"] = CURRENT_MAX_A
     for name in ("start", "end"):
-        mpc.set_nl_cons(name, model.aux[name], ub=LIMIT_V, soft_constraint=True, penalty_term_cons=PENALTY)
+        mpc.set_nl_cons(f"{name}_max", model.aux[name], ub=LIMIT_V, soft_constraint=True, penalty_term_cons=PENALTY)
+        mpc.set_nl_cons(f"{name}_min", -model.aux[name], ub=-LOWEST_V, soft_constraint=True, penalty_term_cons=PENALTY)
     mpc.setup()
     x = np.array([[problem.soc_start], [0.0]])
     mpc.x0 = x
@@ -56,9 +57,11 @@ def ipopt_loop(problem, steps):
     state, cost, rows = start, PENALTY * slack, []
     for i in range(horizon):
         cost += (1 - state[0]) ** 2
-        rows.append(own.h(state, inputs[i], own.nominal)[0] - slack)
-        state = own.f(state, inputs[i], own.nominal)
-        rows.append(own.h(state, inputs[i], own.nominal)[0] - slack)
+        after = own.f(state, inputs[i], own.nominal)
+        for end in (state, after):
+            voltage = own.h(end, inputs[i], own.nominal)[0]
+            rows += [voltage - LIMIT_V - slack, LOWEST_V - voltage - slack]
+        state = after
     cost += (1 - state[0]) ** 2
     nlp = {"x": ca.vertcat(inputs, slack), "p": start, "f": cost, "g": ca.vertcat(*rows)}
     options = {"ipopt": {"print_level": 0, "sb": "yes", "warm_start_init_point": "yes"}, "print_time": False}
@@ -66,7 +69,7 @@ def ipopt_loop(problem, steps):
     guess = {"x0": np.zeros(horizon + 1), "lam_x0": 0.0, "lam_g0": 0.0}
 
     def act(x):
-        found = solve(p=x, lbx=0.0, ubx=[CURRENT_MAX_A] * horizon + [np.inf], lbg=-np.inf, ubg=LIMIT_V, **guess)
+        found = solve(p=x, lbx=0.0, ubx=[CURRENT_MAX_A] * horizon + [np.inf], lbg=-np.inf, ubg=0.0, **guess)
         plan = np.array(found["x"]).ravel()
         guess.update(x0=np.concatenate([plan[1:horizon], plan[horizon - 1 :]]), lam_x0=found["lam_x"], lam_g0=found["lam_g"])
         return plan[0]
