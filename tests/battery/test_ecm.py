@@ -46,7 +46,8 @@ def test_discretisation_is_exact(z, u1, current):
         return [current / (3600 * CELL.capacity_Ah), (current - x[1] / r1) / c1]
 
     solution = solve_ivp(rate, (0.0, STEP), [z, u1], method="DOP853", rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(following([z, u1], current), solution.y[:, -1], rtol=ROUNDING, atol=1e-8)
+    # U1 is a sum of terms up to 0.3 V, each with the floor's rounding; where they cancel only their size counts.
+    np.testing.assert_allclose(following([z, u1], current), solution.y[:, -1], rtol=ROUNDING, atol=0.3 * ROUNDING)
 
 
 def test_two_half_steps_are_one_step_where_the_tables_are_flat():

@@ -5,10 +5,11 @@ import numpy as np
 
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.estimators import ExactState
+from chargetune.control.ipopt import multiple_shooting
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameters import Parameter, ParameterSpace
 
-__all__ = ["SLOTS", "controller", "model", "plant_model"]
+__all__ = ["SLOTS", "SPACE", "controller", "ipopt_solution", "model", "plant_model", "random_point"]
 
 SPACE = ParameterSpace((Parameter("t", 0.5, 2.0, 1.0),))
 
@@ -96,3 +97,20 @@ def random_point(problem, seed=0):
     now = rng.normal(0, 0.4, len(own.model.states))
     lower, upper = (np.array(b).ravel() for b in problem.bounds(now, q))
     return now, rng.uniform(lower, upper), q, lower, upper
+
+
+def ipopt_solution(own, now, inputs):
+    """(U, multipliers of the rows) by IPOPT."""
+    nlp = multiple_shooting(own)
+    size, nx, limits = inputs.size, len(own.model.states), len(own.limits)
+    rest = own.horizon * nx
+    found = nlp.solver(
+        x0=np.concatenate([inputs, np.tile(now, own.horizon), np.zeros(limits)]),
+        p=np.concatenate([now, own.theta.default, own.setpoint, own.model.nominal]),
+        lbx=np.concatenate([np.full(size, -0.9), np.full(rest, -np.inf), np.zeros(limits)]),
+        ubx=np.concatenate([np.full(size, 0.9), np.full(rest + limits, np.inf)]),
+        lbg=np.concatenate([np.zeros(rest), np.full(nlp.inequalities, -np.inf)]),
+        ubg=0.0,
+    )
+    assert nlp.solver.stats()["success"]
+    return np.array(found["x"]).ravel()[:size], np.array(found["lam_g"]).ravel()[rest:]

@@ -1,5 +1,6 @@
 """What a controller refuses to be built from."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from systems import SPACE, controller, model
@@ -29,6 +30,9 @@ GOOD = {"horizon": 5, "stage_cost": lambda s: s.x["position"] ** 2, "input_lower
         ({"parameters": lambda s: {"gain": s.x.vector}}, ["gain", "shape"]),
         ({"stage_cost": lambda s: s.x.vector}, ["stage_cost", "scalar"]),
         ({"stage_cost": lambda s: -(s.x["position"] ** 2)}, ["stage_cost", "convex"]),
+        # Convex where the random points are, not at the start and at the set-point.
+        ({"stage_cost": lambda s: -(ca.fmax(0, s.x["position"] - 5) ** 2), "start": {"position": 6.0}}, ["stage_cost", "convex"]),
+        ({"stage_cost": lambda s: -(ca.fmax(0, s.u["force"] - 5) ** 2), "setpoint": {"force": 6.0}}, ["stage_cost", "convex"]),
         ({"terminal_cost": lambda s: s.u["force"] ** 2}, ["terminal_cost", "input"]),
         ({"limits": [SoftLimit("weight", upper=1.0)]}, ["weight", "load"]),
         ({"limits": [SoftLimit("load", upper=1.0, at="terminal")]}, ["load", "terminal", "feedthrough"]),

@@ -1,14 +1,15 @@
-"""The solver against finite differences, dense algebra and IPOPT, and against sabotage."""
+"""The solver against IPOPT, against sabotage, and at the edges of what it is given."""
 
 import casadi as ca
 import numpy as np
 import pytest
-from systems import SPACE, controller, model, plant_model, random_point
+from systems import SPACE, controller, ipopt_solution, plant_model, random_point
 
+from chargetune.control import sqp
 from chargetune.control.controller import Controller, SoftLimit
-from chargetune.control.estimators import ExactState
-from chargetune.control.ipopt import ipopt_act, multiple_shooting
-from chargetune.control.mpc import begin, control_step, problem_of
+from chargetune.control.estimators import ExactState, Propagated
+from chargetune.control.ipopt import ipopt_act
+from chargetune.control.mpc import act, begin, control_step, problem_of
 from chargetune.control.qp import daqp
 from chargetune.control.sqp import KKT_TOLERANCE, SolveStatus, cold, solver
 from chargetune.episode.compiled import simulate
@@ -16,75 +17,6 @@ from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameters import ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
-
-
-def differences(function, at, step=1e-6):
-    columns = []
-    for k in range(len(at)):
-        ahead, behind = at.copy(), at.copy()
-        ahead[k] += step
-        behind[k] -= step
-        columns.append((function(ahead) - function(behind)) / (2 * step))
-    return np.array(columns).T
-
-
-@pytest.mark.parametrize("slot", ["l", "X", "E"])
-def test_condensed_gradient_and_jacobian_are_those_of_finite_differences(slot):
-    problem = problem_of(controller(slot))
-    now, inputs, q, lower, upper = random_point(problem)
-    _, rows, derivatives = problem.sweep(now, inputs, q)
-    hessian, gradient, jacobian, uba, lbx, ubx, span, gamma = (
-        np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper)
-    )
-    size = problem.size
-    slope = differences(lambda u: float(problem.sweep(now, u, q)[0]), inputs)
-    np.testing.assert_allclose(gradient[:size, 0], gamma[0, 0] * span[:, 0] * slope, rtol=1e-6, atol=1e-7)
-    matrix = differences(lambda u: np.array(problem.sweep(now, u, q)[1]).ravel(), inputs)
-    np.testing.assert_allclose(jacobian[:, :size], matrix * span[:, 0], rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(uba, -np.array(rows))
-    np.testing.assert_allclose(lbx[:size, 0] * span[:, 0] + inputs, lower)
-    np.testing.assert_allclose(ubx[:size, 0] * span[:, 0] + inputs, upper)
-    assert np.mean(np.diag(hessian)[:size]) == pytest.approx(1.0, rel=1e-6)
-
-
-def test_condensed_hessian_is_gauss_newton_by_dense_algebra():
-    own = controller("l")
-    problem = problem_of(own)
-    now, inputs, q, lower, upper = random_point(problem)
-    _, rows, derivatives = problem.sweep(now, inputs, q)
-    hessian, *_, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
-
-    def trajectory(u):
-        x, out = now, []
-        for value in u:
-            x = np.array(own.model.f(x, value, own.model.nominal)).ravel()
-            out.append(x)
-        return np.array(out).ravel()
-
-    states = differences(trajectory, inputs).reshape(own.horizon, 2, problem.size)
-    # l = (position - 1)^2 + 0.1 t force^2 at x_0 .. x_{N-1}, Vf = 5 (position - 1)^2 at x_N
-    dense = 2 * 0.1 * np.eye(problem.size)
-    for i in range(own.horizon - 1):
-        dense += 2 * np.outer(states[i, 0], states[i, 0])
-    dense += 10 * np.outer(states[-1, 0], states[-1, 0])
-    scaled = gamma[0, 0] * span * dense * span.T
-    np.testing.assert_allclose(hessian[: problem.size, : problem.size], scaled + 1e-8 * np.eye(problem.size), rtol=1e-5, atol=1e-6)
-
-
-def ipopt_solution(own, now, inputs):
-    nlp = multiple_shooting(own)
-    size, nx, limits = inputs.size, len(own.model.states), len(own.limits)
-    rest = own.horizon * nx
-    found = nlp.solver(
-        x0=np.concatenate([inputs, np.tile(now, own.horizon), np.zeros(limits)]),
-        p=np.concatenate([now, own.theta.default, own.setpoint, own.model.nominal]),
-        lbx=np.concatenate([np.full(size, -0.9), np.full(rest, -np.inf), np.zeros(limits)]),
-        ubx=np.concatenate([np.full(size, 0.9), np.full(rest + limits, np.inf)]),
-        lbg=np.concatenate([np.zeros(rest), np.full(nlp.inequalities, -np.inf)]),
-        ubg=0.0,
-    )
-    assert nlp.solver.stats()["success"]
-    return np.array(found["x"]).ravel()[:size]
 
 
 @pytest.mark.parametrize("slot", ["l", "E"])
@@ -96,7 +28,7 @@ def test_solution_is_that_of_ipopt(slot, seed):
     solution, _, status, kkt, _ = solver(problem)(now, np.concatenate([inputs, cold(problem, np.zeros(1))[problem.size :]]), q)
     assert int(status) == SolveStatus.CONVERGED
     assert float(kkt) <= KKT_TOLERANCE
-    reference = ipopt_solution(own, now, inputs)
+    reference, _ = ipopt_solution(own, now, inputs)
 
     def merit(u):
         cost, rows, _ = problem.sweep(now, u, q)
@@ -105,19 +37,6 @@ def test_solution_is_that_of_ipopt(slot, seed):
     # What the tolerance leaves of a violation, 1e-4 of a scale of 0.1, costs 1e3 a unit in each of three limits.
     assert merit(np.array(solution).ravel()) <= merit(reference) + 3 * KKT_TOLERANCE * 0.1 * 1e3
     assert float(solution[0]) == pytest.approx(reference[0], abs=2e-3)
-
-
-def test_residual_sees_a_point_that_is_not_optimal():
-    problem = problem_of(controller("l"))
-    now, _, q, lower, upper = random_point(problem, 1)
-    solution, *_ = solver(problem)(now, cold(problem, np.zeros(1)), q)
-    best = np.array(solution).ravel()
-    step = solver(problem)
-    assert float(step(now, cold(problem, np.zeros(1)), q)[3]) <= KKT_TOLERANCE
-    moved = np.clip(best + 0.05, lower, upper)
-    _, rows, derivatives = problem.sweep(now, moved, q)
-    gamma = problem.quadratic(moved, rows, derivatives, lower, upper)[-1]
-    assert float(problem.residual(moved, rows, derivatives, np.zeros(len(problem.groups)), gamma, lower, upper)) > 100 * KKT_TOLERANCE
 
 
 SABOTAGE = {
@@ -155,10 +74,10 @@ def test_a_qp_solver_that_is_silently_wrong_is_caught(kind):
 
 
 def steep():
-    """x+ = x + tanh(4 u): far from the solution the linearisation promises much more than there is."""
+    """x+ = x + atan(u): Gauss-Newton with full steps diverges from |u| > 1.4 on, a textbook case."""
 
     def equations(x, u, p):
-        return {"x": x["x"] + ca.tanh(4 * u["u"])}, {"x": x["x"]}
+        return {"x": x["x"] + ca.atan(u["u"])}, {"x": x["x"]}
 
     return Model.build(
         "steep",
@@ -171,70 +90,39 @@ def steep():
     )
 
 
-def steep_controller(**changes):
-    settings = {"horizon": 1, "stage_cost": lambda s: 1e-3 * s.u["u"] ** 2, "terminal_cost": lambda s: (s.x["x"] - 0.2) ** 2, **changes}
-    return Controller.build(steep(), ParameterSpace(()), input_lower={"u": -3.0}, input_upper={"u": 3.0}, **settings)
-
-
-def test_line_search_converges_where_full_steps_would_not():
-    own = steep_controller(iterations_max=30)
+def steep_solution(iterations_max):
+    own = Controller.build(
+        steep(),
+        ParameterSpace(()),
+        horizon=1,
+        stage_cost=lambda s: 1e-10 * s.u["u"] ** 2,
+        terminal_cost=lambda s: (s.x["x"] - 0.2) ** 2,
+        input_lower={"u": -100.0},
+        input_upper={"u": 100.0},
+        iterations_max=iterations_max,
+    )
     problem = problem_of(own)
     q = problem.prepare(np.zeros(0), ca.DM(own.setpoint), own.model.nominal)
-    inputs, _, status, kkt, count = solver(problem)(np.zeros(1), cold(problem, np.array([0.45])), q)
-    assert int(status) == SolveStatus.CONVERGED
-    grid = np.linspace(-3, 3, 60_001)
-    best = grid[np.argmin(1e-3 * grid**2 + (np.tanh(4 * grid) - 0.2) ** 2)]
-    assert float(inputs) == pytest.approx(best, abs=1e-3)
-    assert int(count) > 1
-    assert float(kkt) <= KKT_TOLERANCE
+    inputs, _, status, kkt, count = solver(problem)(np.zeros(1), cold(problem, np.array([3.0])), q)
+    return float(inputs), SolveStatus(int(status)), float(kkt), int(count)
+
+
+def test_line_search_converges_where_full_steps_do_not(monkeypatch):
+    best = np.tan(0.2)
+    found, status, kkt, count = steep_solution(30)
+    assert (status, count > 1, kkt <= KKT_TOLERANCE) == (SolveStatus.CONVERGED, True, True)
+    assert found == pytest.approx(best, abs=0.02)
+    monkeypatch.setattr(sqp, "HALVINGS_MAX", 0)
+    found, status, *_ = steep_solution(30)
+    assert status is SolveStatus.NOT_CONVERGED
+    assert abs(found - best) > 10
 
 
 def test_iteration_limit_is_told():
-    own = steep_controller(iterations_max=1)
-    problem = problem_of(own)
-    q = problem.prepare(np.zeros(0), ca.DM(own.setpoint), own.model.nominal)
-    inputs, _, status, kkt, count = solver(problem)(np.zeros(1), cold(problem, np.array([0.45])), q)
-    assert (int(status), int(count)) == (SolveStatus.NOT_CONVERGED, 1)
-    assert float(kkt) > KKT_TOLERANCE
-    assert -3 <= float(inputs) <= 3
-
-
-def soft(penalty):
-    return controller(
-        "l",
-        limits=[SoftLimit("speed", upper=0.25, at="end", penalty=penalty, scale=0.1)],
-        stage_cost=lambda s: (s.x["position"] - 1) ** 2 + 0.1 * s.u["force"] ** 2,
-    )
-
-
-def test_penalty_is_exact_above_the_multipliers_and_visible_below():
-    plant = SimulatedPlant(model(), {})
-    exact = simulate(soft(1e3), plant, steps=40)
-    assert np.max(exact.signal("speed")[1]) <= 0.25 + 1e-5
-    larger = simulate(soft(1e5), plant, steps=40)
-    np.testing.assert_allclose(exact.input, larger.input, atol=2e-3)
-    weak = simulate(soft(1e-2), plant, steps=40)
-    assert np.max(weak.signal("speed")[1]) > 0.26
-    assert exact.failures == larger.failures == weak.failures == 0
-
-
-def test_an_impossible_limit_is_broken_as_little_as_possible():
-    own = controller("l", limits=[SoftLimit("position", upper=-1.0, at="end", penalty=1e4, scale=0.1)])
-    episode = simulate(own, SimulatedPlant(model(), {}), steps=60)
-    assert episode.failures == 0
-    assert np.all(episode.input >= -0.9)
-    # The cost pulls to +1, the limit is -1: it goes there as far as the force can push.
-    position = episode.signal("position")[1]
-    assert np.all(np.diff(position) <= 1e-6)
-    assert position[-1] < -0.9
-
-
-def test_a_state_beyond_its_limit_comes_back_although_the_cost_pulls_outwards():
-    """Only the growing weights of later violations do this: with equal ones the whole horizon may be as bad as its start."""
-    own = controller("l", limits=[SoftLimit("position", upper=0.2, at="end", penalty=1e3, scale=0.1)])
-    episode = simulate(own, SimulatedPlant(model(), {"position": 0.6}), steps=60)
-    assert episode.failures == 0
-    assert episode.signal("position")[1][-1] < 0.21
+    found, status, kkt, count = steep_solution(1)
+    assert (status, count) == (SolveStatus.NOT_CONVERGED, 1)
+    assert kkt > KKT_TOLERANCE
+    assert -100 <= found <= 100
 
 
 @pytest.mark.parametrize("horizon", [1, 50])
@@ -295,11 +183,53 @@ def test_a_measurement_that_is_no_number_gives_the_fallback(bad):
     assert np.all(np.isfinite(np.array(warm)))
 
 
-def test_exact_state_goes_on_after_a_blind_step():
+def test_a_measurement_that_comes_back_ends_the_fallback():
     own = controller("l", estimator=ExactState())
     step, problem, memory = control_step(problem_of(own)), problem_of(own), begin(own)
     q = problem.prepare(SPACE.default, ca.DM(own.setpoint), own.model.nominal)
     _, ahead, warm, status, *_ = step(memory.estimator, np.array([np.nan, 0.0]), memory.last_input, memory.warm, q)
+    assert int(status) == SolveStatus.FALLBACK
     u, _, _, status, *_ = step(ahead, np.array([0.1, 0.0]), memory.last_input, warm, q)
     assert int(status) == SolveStatus.CONVERGED
     assert np.isfinite(float(u))
+
+
+def test_propagated_states_stand_in_for_a_lost_measurement():
+    own = controller("l", estimator=Propagated(("position",)), start={"position": 0.1, "speed": 0.05})
+    problem, memory = problem_of(own), begin(own)
+    step = control_step(problem)
+    q = problem.prepare(SPACE.default, ca.DM(own.setpoint), own.model.nominal)
+    blind = step(memory.estimator, np.array([np.nan]), memory.last_input, memory.warm, q)
+    seeing = step(memory.estimator, np.array([0.1]), memory.last_input, memory.warm, q)
+    assert int(blind[3]) == SolveStatus.CONVERGED
+    for one, other in zip(blind, seeing, strict=True):
+        np.testing.assert_array_equal(np.array(one), np.array(other))
+
+
+@pytest.mark.parametrize(("bad", "count"), [(np.nan, 20), (0.0, 0)])
+def test_fallbacks_are_counted_step_by_step_and_bounded(bad, count):
+    own, memory, statuses = controller("l"), begin(controller("l")), []
+    for _ in range(20):
+        u, memory, info = act(own, np.array([bad, 0.0]), SPACE.default, memory)
+        assert abs(float(u[0])) <= 0.9
+        statuses.append(info.status)
+    assert statuses.count(SolveStatus.FALLBACK) == count
+
+
+def test_bounds_that_depend_on_a_lost_state_are_those_at_zero():
+    own = controller("l", input_upper={"force": lambda s: 0.5 - s.now["speed"]}, input_lower={"force": -0.9}, fallback={"force": 5.0})
+    u, _, info = act(own, np.array([0.0, np.nan]), SPACE.default, begin(own))
+    assert (float(u[0]), info.status) == (0.5, SolveStatus.FALLBACK)
+
+
+def test_the_warm_start_is_the_solution_a_stage_later():
+    own = controller("l", horizon=3)
+    problem = problem_of(own)
+    width, stages = problem.row_width, range(3)
+    inputs = [f"u{i}" for i in stages]
+    bounds, slacks = [f"bound{i}" for i in stages], [f"slack{j}" for j in range(len(own.limits))]
+    rows = [f"row{i}.{k}" for i in stages for k in range(width)]
+    labels = [*inputs, *bounds, *slacks, *rows, "terminal"]
+    assert len(labels) == cold(problem, np.zeros(1)).size
+    later = [f"row{min(i + 1, 2)}.{k}" for i in stages for k in range(width)]
+    assert [labels[i] for i in sqp._shift(problem)] == ["u1", "u2", "u2", "bound1", "bound2", "bound2", *slacks, *later, "terminal"]

@@ -153,7 +153,9 @@ class Controller:
             raise ValueError(f"controller: horizon = {horizon!r}, allowed is an integer in [1, {HORIZON_MAX}]")
         if isinstance(iterations_max, bool) or not isinstance(iterations_max, int) or iterations_max < 1:
             raise ValueError(f"controller: iterations_max = {iterations_max!r}, allowed is an integer >= 1")
-        symbols = _Symbols(model, theta)
+        wanted = _named_values("setpoint", setpoint or {}, (*model.state_names, *model.input_names))
+        begin = _named_values("start", start or {}, model.state_names)
+        symbols = _Symbols(model, theta, wanted, begin)
         for label, given in (("input_lower", input_lower), ("input_upper", input_upper)):
             if set(given) != set(model.input_names):
                 raise ValueError(f"controller: {label} names {sorted(given)}, expected {list(model.input_names)}")
@@ -175,8 +177,8 @@ class Controller:
             input_lower=symbols.inputs("input_lower", input_lower),
             input_upper=symbols.inputs("input_upper", input_upper),
             fallback=symbols.inputs("fallback", declared),
-            setpoint=_named_values("setpoint", setpoint or {}, (*model.state_names, *model.input_names)),
-            start=_named_values("start", start or {}, model.state_names),
+            setpoint=wanted,
+            start=begin,
             estimator=estimator or ExactState(),
             iterations_max=iterations_max,
         )
@@ -202,8 +204,8 @@ class Controller:
 class _Symbols:
     """One set of symbols, so that all functions of a controller have the same arguments."""
 
-    def __init__(self, model: Model, theta: ParameterSpace) -> None:
-        self.model, self.space = model, theta
+    def __init__(self, model: Model, theta: ParameterSpace, wanted: tuple[float, ...], begin: tuple[float, ...]) -> None:
+        self.model, self.space, self.wanted, self.begin = model, theta, np.array(wanted), np.array(begin)
         sizes = {p.name: p.size for p in theta.parameters}
         nx, nu, np_ = len(model.states), len(model.inputs), sum(model.parameter_blocks.values())
         self.x, self.u, self.p = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_)
@@ -247,16 +249,17 @@ class _Symbols:
         return function
 
     def _check_convex(self, label: str, value: Any) -> None:
-        """Look at the curvature in (x, u) at random points; the solver needs a model of the cost that is bounded below."""
+        """Look at the curvature in (x, u) at start, set-point and random points: the QP must be bounded below."""
         curvature, _ = ca.hessian(value, ca.vertcat(self.x, self.u))
-        symbols = [self.x, self.u, self.theta, self.p, self.setpoint, self.now]
-        evaluate = ca.Function("curvature", symbols, [curvature])
+        evaluate = ca.Function("curvature", [self.x, self.u, self.theta, self.p, self.setpoint, self.now], [curvature])
         draw = np.random.default_rng(0)
-        lower, upper = self.space.lower, self.space.upper
+        default, nx, size = self.space.default, self.begin.size, self.wanted.size
+        places = [(np.pad(self.begin, (0, size - nx)), default, self.begin), (self.wanted, default, self.wanted[:nx])]
         for _ in range(CONVEXITY_POINTS):
-            theta = draw.uniform(lower, upper) if lower.size else np.zeros(0)
-            x, u, setpoint, now = (draw.uniform(-1.0, 1.0, s.shape[0]) for s in (self.x, self.u, self.setpoint, self.now))
-            matrix = np.array(evaluate(x, u, theta, self.model.nominal, setpoint, now))
+            theta = draw.uniform(self.space.lower, self.space.upper) if default.size else default
+            places.append((draw.uniform(-1.0, 1.0, size), theta, draw.uniform(-1.0, 1.0, nx)))
+        for xu, theta, now in places:
+            matrix = np.array(evaluate(xu[:nx], xu[nx:], theta, self.model.nominal, self.wanted, now))
             if not np.all(np.isfinite(matrix)):
                 continue
             values = np.linalg.eigvalsh(matrix)

@@ -212,7 +212,8 @@ def _merit(controller: Controller, groups: tuple[int, ...]) -> ca.Function:
     for limit, s in zip(controller.limits, _violations(controller, groups, rows), strict=True):
         merit += limit.penalty * limit.scale * (s + s**2 / 2)
     # The running maximum drops a NaN; the sum keeps it, so that the line search refuses the point.
-    return ca.Function("merit", [cost, rows], [merit + 0 * ca.sum1(rows) if groups else merit])
+    known = finite(ca.sum1(rows)) if groups else 1
+    return ca.Function("merit", [cost, rows], [ca.if_else(known, merit, np.inf)])
 
 
 def _span(lower: Any, upper: Any) -> Any:

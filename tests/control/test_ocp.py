@@ -1,0 +1,115 @@
+"""The condensed problem against finite differences and dense algebra; the residual against IPOPT."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from systems import controller, ipopt_solution, random_point
+
+from chargetune.control.controller import SoftLimit
+from chargetune.control.mpc import problem_of
+from chargetune.control.sqp import KKT_TOLERANCE, cold, solver
+
+
+def differences(function, at, step=1e-6):
+    columns = []
+    for k in range(len(at)):
+        ahead, behind = at.copy(), at.copy()
+        ahead[k] += step
+        behind[k] -= step
+        columns.append((function(ahead) - function(behind)) / (2 * step))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("slot", ["l", "X", "E"])
+def test_condensed_gradient_and_jacobian_are_those_of_finite_differences(slot):
+    problem = problem_of(controller(slot))
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    hessian, gradient, jacobian, uba, lbx, ubx, span, gamma = (
+        np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper)
+    )
+    size = problem.size
+    slope = differences(lambda u: float(problem.sweep(now, u, q)[0]), inputs)
+    np.testing.assert_allclose(gradient[:size, 0], gamma[0, 0] * span[:, 0] * slope, rtol=1e-6, atol=1e-7)
+    matrix = differences(lambda u: np.array(problem.sweep(now, u, q)[1]).ravel(), inputs)
+    np.testing.assert_allclose(jacobian[:, :size], matrix * span[:, 0], rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(uba, -np.array(rows))
+    np.testing.assert_allclose(lbx[:size, 0] * span[:, 0] + inputs, lower)
+    np.testing.assert_allclose(ubx[:size, 0] * span[:, 0] + inputs, upper)
+    assert np.mean(np.diag(hessian)[:size]) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_condensed_hessian_is_gauss_newton_by_dense_algebra():
+    """l = (position - 1 + 0.3 force)^2 + 0.1 force^2 at x_0 .. x_{N-1}, Vf = 5 (position - 1)^2 at x_N."""
+    own = controller(stage_cost=lambda s: (s.x["position"] - 1 + 0.3 * s.u["force"]) ** 2 + 0.1 * s.u["force"] ** 2)
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    hessian, *_, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+
+    def positions(u):
+        x, out = now, []
+        for value in u:
+            out.append(x[0])
+            x = np.array(own.model.f(x, value, own.model.nominal)).ravel()
+        return np.array([*out, x[0]])
+
+    of_inputs = differences(positions, inputs)
+    residuals = [*(of_inputs[:-1] + 0.3 * np.eye(problem.size)), *(np.sqrt(0.1) * np.eye(problem.size)), np.sqrt(5) * of_inputs[-1]]
+    dense = 2 * np.array(residuals).T @ np.array(residuals)
+    scaled = gamma[0, 0] * span * dense * span.T
+    np.testing.assert_allclose(hessian[: problem.size, : problem.size], scaled + 1e-8 * np.eye(problem.size), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_residual_is_zero_where_ipopt_says_it_is_optimal_and_nowhere_near(seed):
+    own = controller("E")
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem, seed)
+    best, multipliers = ipopt_solution(own, now, inputs)
+
+    def residual(at, duals):
+        _, rows, derivatives = problem.sweep(now, at, q)
+        gamma = problem.quadratic(at, rows, derivatives, lower, upper)[-1]
+        return float(problem.residual(at, rows, derivatives, float(gamma) * 0.1 * duals, gamma, lower, upper))
+
+    assert residual(best, multipliers) < 1e-5
+    inward = np.where(best > 0, -0.05, 0.05)
+    assert residual(best + inward, multipliers) > 100 * KKT_TOLERANCE
+    assert residual(best, multipliers + 1.0) > 100 * KKT_TOLERANCE
+    assert np.isinf(residual(best * np.nan, multipliers))
+
+
+def test_residual_sees_a_multiplier_of_an_unused_row():
+    """The same one added to the upper and the lower row cancels in the gradient: only complementarity is wrong."""
+    own = controller("l", limits=[SoftLimit("speed", lower=-5.0, upper=5.0, at="end")])
+    problem = problem_of(own)
+    now, _, q, lower, upper = random_point(problem)
+    inputs, *_ = solver(problem)(now, cold(problem, np.zeros(1)), q)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    gamma = problem.quadratic(inputs, rows, derivatives, lower, upper)[-1]
+    none, both = np.zeros(2 * own.horizon), np.zeros(2 * own.horizon)
+    both[:2] = 0.3
+    assert float(problem.residual(inputs, rows, derivatives, none, gamma, lower, upper)) <= KKT_TOLERANCE
+    assert float(problem.residual(inputs, rows, derivatives, both, gamma, lower, upper)) == pytest.approx(0.3)
+
+
+def test_merit_refuses_a_point_where_a_row_is_no_number():
+    problem = problem_of(controller("l"))
+    rows = np.full(len(problem.groups), -1.0)
+    assert float(problem.merit(2.0, rows)) == 2.0
+    rows[3] = np.nan
+    assert np.isinf(float(problem.merit(2.0, rows)))
+
+
+@pytest.mark.parametrize("at", ["start", "end", "both"])
+def test_a_limit_without_the_input_in_it_is_set_at_the_end_only(at):
+    """The value at the start of an interval is given or the one at the end of the interval before."""
+    own = controller("l", limits=[SoftLimit("position", upper=0.1, at=at)])
+    assert own.limits[0].at == "end"
+    problem = problem_of(own)
+    q = problem.prepare(own.theta.default, ca.DM(own.setpoint), own.model.nominal)
+    # x_0 is beyond the limit and nothing can be done about it: it is no row.
+    rows = np.array(problem.sweep([0.2, -1.0], np.zeros(problem.size), q)[1]).ravel()
+    assert rows.size == own.horizon
+    assert rows[0] < 0
