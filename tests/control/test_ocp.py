@@ -20,32 +20,51 @@ def differences(function, at, step=1e-6):
     return np.array(columns).T
 
 
+def coordinates(problem, inputs, rows, derivatives, lower, upper):
+    """(g, T, rows of A, lba, uba, span, gamma) of the QP with v = T e and the slacks apart."""
+    g, columns, lba, uba, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+    slacks, size = len(problem.controller.limits), problem.size
+    return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma[0, 0])
+
+
 @pytest.mark.parametrize("slot", ["l", "X", "E"])
 def test_condensed_gradient_and_jacobian_are_those_of_finite_differences(slot):
     problem = problem_of(controller(slot))
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    hessian, gradient, jacobian, uba, lbx, ubx, span, gamma = (
-        np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper)
-    )
+    gradient, transform, jacobian, lba, uba, span, gamma = coordinates(problem, inputs, rows, derivatives, lower, upper)
     size = problem.size
     slope = differences(lambda u: float(problem.sweep(now, u, q)[0]), inputs)
-    np.testing.assert_allclose(gradient[:size, 0], gamma[0, 0] * span[:, 0] * slope, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(gradient, transform.T @ (gamma * span * slope), rtol=1e-6, atol=1e-7)
     matrix = differences(lambda u: np.array(problem.sweep(now, u, q)[1]).ravel(), inputs)
-    np.testing.assert_allclose(jacobian[:, :size], matrix * span[:, 0], rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(uba, -np.array(rows))
-    np.testing.assert_allclose(lbx[:size, 0] * span[:, 0] + inputs, lower)
-    np.testing.assert_allclose(ubx[:size, 0] * span[:, 0] + inputs, upper)
-    assert np.mean(np.diag(hessian)[:size]) == pytest.approx(1.0, rel=1e-6)
+    np.testing.assert_allclose(jacobian, matrix * span @ transform, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(uba[size:], -np.array(rows).ravel())
+    assert np.all(lba[size:] == -np.inf)
+    np.testing.assert_allclose(lba[:size] * span + inputs, lower)
+    np.testing.assert_allclose(uba[:size] * span + inputs, upper)
 
 
-def test_condensed_hessian_is_gauss_newton_by_dense_algebra():
+def test_slacks_stand_against_their_rows_with_the_penalty_as_price():
+    own = controller("X")
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    g, columns, *_, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+    for j, limit in enumerate(own.limits):
+        price = float(gamma[0, 0]) * limit.penalty * limit.scale
+        # s = e / sqrt(price) costs price (s + s^2 / 2).
+        assert g[j, 0] == pytest.approx(np.sqrt(price))
+        wanted = [0.0] * problem.size + [-1 / np.sqrt(price) if group == j else 0.0 for group in problem.groups]
+        np.testing.assert_allclose(columns[j], wanted)
+
+
+def test_transformed_hessian_is_gauss_newton_by_dense_algebra():
     """l = (position - 1 + 0.3 force)^2 + 0.1 force^2 at x_0 .. x_{N-1}, Vf = 5 (position - 1)^2 at x_N."""
     own = controller(stage_cost=lambda s: (s.x["position"] - 1 + 0.3 * s.u["force"]) ** 2 + 0.1 * s.u["force"] ** 2)
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    hessian, *_, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+    _, transform, *_, span, gamma = coordinates(problem, inputs, rows, derivatives, lower, upper)
 
     def positions(u):
         x, out = now, []
@@ -57,8 +76,9 @@ def test_condensed_hessian_is_gauss_newton_by_dense_algebra():
     of_inputs = differences(positions, inputs)
     residuals = [*(of_inputs[:-1] + 0.3 * np.eye(problem.size)), *(np.sqrt(0.1) * np.eye(problem.size)), np.sqrt(5) * of_inputs[-1]]
     dense = 2 * np.array(residuals).T @ np.array(residuals)
-    scaled = gamma[0, 0] * span * dense * span.T
-    np.testing.assert_allclose(hessian[: problem.size, : problem.size], scaled + 1e-8 * np.eye(problem.size), rtol=1e-5, atol=1e-6)
+    scaled = gamma * span[:, None] * dense * span + 1e-8 * np.eye(problem.size)
+    assert np.mean(np.diag(scaled)) == pytest.approx(1.0, rel=1e-5)
+    np.testing.assert_allclose(transform.T @ scaled @ transform, np.eye(problem.size), atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))

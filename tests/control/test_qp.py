@@ -6,79 +6,89 @@ import pytest
 
 from chargetune.control.qp import daqp, daqp_warm
 
-VARIABLES, ROWS = 7, 12
+SLACKS, VARIABLES, ROWS = 2, 5, 12
+N, DUALS = SLACKS + VARIABLES, SLACKS + ROWS
+NOTHING = np.zeros(DUALS)
 
 
 def random_qp(rng, kind):
-    root = rng.normal(size=(VARIABLES, VARIABLES))
-    h, g = root @ root.T + 0.1 * np.eye(VARIABLES), 5 * rng.normal(size=VARIABLES)
-    a, b = rng.normal(size=(ROWS, VARIABLES)), rng.uniform(0.1, 1.0, ROWS)
-    low, high = -rng.uniform(0.1, 1.0, VARIABLES), rng.uniform(0.1, 1.0, VARIABLES)
+    g, a = 3 * rng.normal(size=N), rng.normal(size=(ROWS, N))
+    low, high = -rng.uniform(0.1, 1.0, ROWS), rng.uniform(0.1, 1.0, ROWS)
+    # Rows of the controller stand only against the first variables with a slack.
+    a[:, :SLACKS] = -np.abs(a[:, :SLACKS])
     if kind == "dependent rows":
-        a[6:], b[6:] = a[:6], b[:6]
+        a[6:], low[6:], high[6:] = a[:6], low[:6], high[:6]
     if kind == "one-sided":
-        high[3:] = np.inf
+        low[:] = -np.inf
     if kind == "fixed variables":
+        a[:2] = np.eye(N)[SLACKS : SLACKS + 2]
         low[:2] = high[:2] = 0.0
-    return h, g, a, b, low, high
+    return g, a.T, low, high
 
 
 @pytest.fixture(scope="module")
 def solvers():
-    return daqp(VARIABLES, ROWS), daqp_warm(VARIABLES, ROWS)
+    return daqp(SLACKS, VARIABLES, ROWS), daqp_warm(SLACKS, VARIABLES, ROWS)
+
+
+def solved(solve, data, guess):
+    return [np.array(o).ravel() for o in solve(*data, guess)]
 
 
 @pytest.mark.parametrize("kind", ["general", "dependent rows", "one-sided", "fixed variables"])
 def test_both_solve_what_the_optimality_conditions_say(kind, solvers):
     rng = np.random.default_rng(0)
     for _ in range(60):
-        h, g, a, b, low, high = data = random_qp(rng, kind)
-        guesses = [np.zeros(VARIABLES + ROWS), rng.normal(size=VARIABLES + ROWS) * (rng.uniform(size=VARIABLES + ROWS) < 0.4)]
+        g, columns, low, high = data = random_qp(rng, kind)
         for solve in solvers:
-            for guess in guesses:
-                x, dual = (np.array(o).ravel() for o in solve(*data, guess))
-                np.testing.assert_allclose(h @ x + g + dual[:VARIABLES] + a.T @ dual[VARIABLES:], 0, atol=1e-7)
-                assert np.all(a @ x <= b + 1e-7)
-                assert np.all((x >= low - 1e-8) & (x <= high + 1e-8))
-                assert np.all(dual[VARIABLES:] >= -1e-9)
-                np.testing.assert_allclose(dual[VARIABLES:] * (b - a @ x), 0, atol=1e-6)
+            for guess in (NOTHING, rng.normal(size=DUALS) * (rng.uniform(size=DUALS) < 0.4)):
+                values, dual = solved(solve, data, guess)
+                # Stationarity gives x from the multipliers; everything else is checked at that x.
+                x = -(g + columns @ dual[SLACKS:] + np.concatenate([dual[:SLACKS], np.zeros(VARIABLES)]))
+                np.testing.assert_allclose(values, columns.T @ x, atol=1e-7)
+                assert np.all((values >= low - 1e-7) & (values <= high + 1e-7))
+                assert np.all(x[:SLACKS] >= -1e-7)
+                assert np.all(dual[:SLACKS] <= 1e-9)
+                np.testing.assert_allclose(dual[:SLACKS] * x[:SLACKS], 0, atol=1e-6)
+                up, down = np.maximum(dual[SLACKS:], 0), np.minimum(dual[SLACKS:], 0)
+                np.testing.assert_allclose(np.where(up > 1e-8, up * (high - values), 0), 0, atol=1e-6)
+                np.testing.assert_allclose(np.where(down < -1e-8, down * (values - np.maximum(low, -1e6)), 0), 0, atol=1e-6)
 
 
 def test_a_right_guess_gives_the_same_solution(solvers):
-    _, warm = solvers
     rng = np.random.default_rng(1)
     for _ in range(50):
         data = random_qp(rng, "general")
-        x, dual = warm(*data, np.zeros(VARIABLES + ROWS))
-        again, _ = warm(*data, dual)
-        np.testing.assert_allclose(np.array(again), np.array(x), atol=1e-9)
+        values, dual = solved(solvers[1], data, NOTHING)
+        np.testing.assert_allclose(solved(solvers[1], data, dual)[0], values, atol=1e-9)
 
 
 def test_what_has_no_solution_gives_no_number(solvers):
-    rng = np.random.default_rng(2)
-    h, g, a, b, low, high = random_qp(rng, "general")
-    a[1], b[1], b[0] = -a[0], -5.0, 1.0
-    x, dual = solvers[1](h, g, a, b, low, high, np.zeros(VARIABLES + ROWS))
-    assert np.all(np.isnan(np.array(x)))
-    assert np.all(np.isnan(np.array(dual)))
-    x, _ = solvers[1](-h, g, a, np.abs(b), low, high, np.zeros(VARIABLES + ROWS))
-    assert np.all(np.isnan(np.array(x)))
+    g, columns, low, high = random_qp(np.random.default_rng(2), "one-sided")
+    columns[:, 1], high[1], high[0] = -columns[:, 0], -5.0, 1.0
+    for part in solved(solvers[1], (g, columns, low, high), NOTHING):
+        assert np.all(np.isnan(part))
+    high[1], low[1] = -5.0, -4.0
+    assert np.all(np.isnan(solved(solvers[1], (g, columns, low, high), NOTHING)[0]))
 
 
-@pytest.mark.parametrize("place", ["H", "g", "A", "uba", "lbx", "ubx"])
-def test_input_that_is_no_number_gives_none_and_the_next_qp_is_solved(place, solvers):
+@pytest.mark.parametrize("place", ["g", "A", "lba", "uba"])
+@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
+def test_input_that_is_no_number_gives_none_and_the_next_qp_is_solved(place, nonsense, solvers):
     data = random_qp(np.random.default_rng(3), "general")
-    guess = np.zeros(VARIABLES + ROWS)
-    at = ["H", "g", "A", "uba", "lbx", "ubx"].index(place)
     broken = [value.copy() for value in data]
-    broken[at].flat[2] = np.nan
-    right = np.array(solvers[1](*data, guess)[0])
-    x, dual = solvers[1](*broken, guess)
-    assert np.all(np.isnan(np.array(x)))
-    assert np.all(np.isnan(np.array(dual)))
-    np.testing.assert_array_equal(np.array(solvers[1](*data, guess)[0]), right)
+    broken[["g", "A", "lba", "uba"].index(place)].flat[2] = nonsense
+    right = solved(solvers[1], data, NOTHING)[0]
+    values, dual = solved(solvers[1], broken, NOTHING)
+    if (place, nonsense) == ("uba", np.inf):
+        # A row without an upper bound is a problem like any other.
+        assert np.all(np.isfinite(values))
+    else:
+        assert np.all(np.isnan(values))
+        assert np.all(np.isnan(dual))
+    np.testing.assert_array_equal(solved(solvers[1], data, NOTHING)[0], right)
     # CasADi's interface need not tell, only return: the caller's own check refuses what it gives.
-    assert solvers[0](*broken, guess)[0].shape == (VARIABLES, 1)
+    assert solvers[0](*broken, NOTHING)[0].shape == (ROWS, 1)
 
 
 @pytest.mark.parametrize("guess", [np.nan, np.inf, -np.inf, 1.0, -1.0])
@@ -86,11 +96,16 @@ def test_a_nonsensical_guess_does_not_change_the_solution(guess, solvers):
     rng = np.random.default_rng(4)
     for kind in ("general", "dependent rows", "one-sided", "fixed variables"):
         data = random_qp(rng, kind)
-        right = np.array(solvers[1](*data, np.zeros(VARIABLES + ROWS))[0])
-        np.testing.assert_allclose(np.array(solvers[1](*data, np.full(VARIABLES + ROWS, guess))[0]), right, atol=1e-8)
+        right = solved(solvers[1], data, NOTHING)[0]
+        np.testing.assert_allclose(solved(solvers[1], data, np.full(DUALS, guess))[0], right, atol=1e-8)
 
 
-def test_no_rows_at_all():
-    x, dual = daqp_warm(3, 0)(np.eye(3), np.array([-2.0, 0.0, 2.0]), ca.DM(0, 3), ca.DM(0, 1), -np.ones(3), np.ones(3), np.zeros(3))
-    np.testing.assert_allclose(np.array(x).ravel(), [1, 0, -1])
+def test_rows_alone():
+    values, dual = daqp_warm(0, 3, 3)(np.array([-2.0, 0.0, 2.0]), ca.DM.eye(3), -np.ones(3), np.ones(3), np.zeros(3))
+    np.testing.assert_allclose(np.array(values).ravel(), [1, 0, -1])
     np.testing.assert_allclose(np.array(dual).ravel(), [1, 0, -1])
+
+
+def test_slacks_alone():
+    _, dual = daqp_warm(2, 1, 1)(np.array([1.0, -2.0, 0.0]), np.array([0.0, 1.0, 0.0]), [-10], [10], np.zeros(3))
+    np.testing.assert_allclose(np.array(dual).ravel(), [-1, 0, 0], atol=1e-12)

@@ -51,8 +51,8 @@ SABOTAGE = {
 
 @pytest.mark.parametrize("kind", SABOTAGE)
 def test_a_qp_solver_that_is_silently_wrong_is_caught(kind):
-    def wrong(variables, rows):
-        right = daqp(variables, rows)
+    def wrong(*shape):
+        right = daqp(*shape)
         arguments = right.mx_in()
         return ca.Function("wrong", arguments, SABOTAGE[kind](*right(*arguments)))
 
@@ -229,7 +229,7 @@ def test_the_warm_start_is_the_solution_a_stage_later():
     inputs = [f"u{i}" for i in stages]
     bounds, slacks = [f"bound{i}" for i in stages], [f"slack{j}" for j in range(len(own.limits))]
     rows = [f"row{i}.{k}" for i in stages for k in range(width)]
-    labels = [*inputs, *bounds, *slacks, *rows, "terminal"]
+    labels = [*inputs, *slacks, *bounds, *rows, "terminal"]
     assert len(labels) == cold(problem, np.zeros(1)).size
     later = [f"row{min(i + 1, 2)}.{k}" for i in stages for k in range(width)]
-    assert [labels[i] for i in sqp._shift(problem)] == ["u1", "u2", "u2", "bound1", "bound2", "bound2", *slacks, *later, "terminal"]
+    assert [labels[i] for i in sqp._shift(problem)] == ["u1", "u2", "u2", *slacks, "bound1", "bound2", "bound2", *later, "terminal"]

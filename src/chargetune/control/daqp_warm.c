@@ -1,13 +1,15 @@
 /* Dense QP by DAQP, warm-started, without memory allocation:
  *
- *   min 1/2 x'Hx + g'x   s.t.   lbx <= x <= ubx,   A x <= uba
+ *   min |x|^2 / 2 + g'x   s.t.   x_i >= 0 for i < QP_SLACKS,   lba <= A x <= uba
  *
- * as a function of CasADi's C interface with arguments (H, g, A, uba, lbx, ubx, guess) and results (x, multipliers).
+ * as a function of CasADi's C interface with arguments (g, A', lba, uba, guess) and results (A x, multipliers).
  * guess and multipliers hold the bounds first, then the rows; positive is active at the upper side, negative at the
- * lower one, zero is inactive. Matrices are column-major on the way in (H is symmetric).
+ * lower one, zero is inactive. Matrices are column-major, so that each row of A stands in one piece.
+ * The Hessian is the identity, which makes this DAQP's own inner problem: nothing has to be factorised for it.
  * Rows are generated: the QP is solved with those that the guess says are active, and again with those that its solution
  * breaks, until it breaks none. Setting up a row costs as much as a pivot and most rows of a long horizon never matter.
- * QP_N variables, QP_M rows and QP_TOLERANCE are set by the compiler's command line, QP_NAME is the name of the function.
+ * QP_SLACKS, QP_VARIABLES (slacks included), QP_ROWS and QP_TOLERANCE are set by the compiler's command line, QP_NAME is
+ * the name of the function.
  * DAQP: Arnstrom, Bemporad, Axehill, IEEE Trans. Automatic Control 67 (2022), doi 10.1109/TAC.2022.3176430.
  */
 #include <daqp/api.h>
@@ -18,26 +20,24 @@
 
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
-#define VARS QP_N
-#define CONS (QP_N + QP_M)
-#define UPDATE_ALL (UPDATE_Rinv + UPDATE_M + UPDATE_v + UPDATE_d + UPDATE_sense)
-#define UPDATE_ROWS (UPDATE_M + UPDATE_d + UPDATE_sense)
+#define VARS QP_VARIABLES
+#define CONS (QP_SLACKS + QP_ROWS)
+#define UPDATES (UPDATE_M + UPDATE_v + UPDATE_d + UPDATE_sense)
 
-long long JOIN(QP_NAME, _n_in)(void) { return 7; }
+long long JOIN(QP_NAME, _n_in)(void) { return 5; }
 long long JOIN(QP_NAME, _n_out)(void) { return 2; }
 
 /* Dense shapes in CasADi's compressed form: rows, columns, 1 = dense. */
-static const long long square[3] = {VARS, VARS, 1}, column[3] = {VARS, 1, 1}, matrix[3] = {QP_M, VARS, 1}, rows[3] = {QP_M, 1, 1}, all[3] = {CONS, 1, 1};
+static const long long column[3] = {VARS, 1, 1}, matrix[3] = {VARS, QP_ROWS, 1}, rows[3] = {QP_ROWS, 1, 1}, all[3] = {CONS, 1, 1};
 const long long *JOIN(QP_NAME, _sparsity_in)(long long i) {
   switch (i) {
-    case 0: return square;
-    case 2: return matrix;
-    case 3: return rows;
-    case 6: return all;
-    default: return column;
+    case 0: return column;
+    case 1: return matrix;
+    case 4: return all;
+    default: return rows;
   }
 }
-const long long *JOIN(QP_NAME, _sparsity_out)(long long i) { return i == 0 ? column : all; }
+const long long *JOIN(QP_NAME, _sparsity_out)(long long i) { return i == 0 ? rows : all; }
 
 /* Below this a row counts as kept; far above rounding, far below the tolerance of the optimality check. */
 #define ROW_TOLERANCE 1e-9
@@ -57,22 +57,32 @@ static void start_from(DAQPWorkspace *work, const double *guess) {
   }
 }
 
-/* DAQP does not survive numbers that are none; bounds may be infinite. */
-static int usable(const double **arg) {
-  int i, bad = 0;
-  for (i = 0; i < VARS * VARS; ++i) bad |= !(fabs(arg[0][i]) <= DBL_MAX);
-  for (i = 0; i < VARS; ++i) bad |= !(fabs(arg[1][i]) <= DBL_MAX) | (arg[4][i] != arg[4][i]) | (arg[5][i] != arg[5][i]);
-  for (i = 0; i < QP_M * VARS; ++i) bad |= !(fabs(arg[2][i]) <= DBL_MAX);
-  for (i = 0; i < QP_M; ++i) bad |= !(fabs(arg[3][i]) <= DBL_MAX);
-  return !bad;
+/* Four sums side by side: one alone would wait for each addition. */
+static double dot(const double *a, const double *b) {
+  double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+  int j = 0;
+  for (; j + 3 < VARS; j += 4) {
+    s0 += a[j] * b[j];
+    s1 += a[j + 1] * b[j + 1];
+    s2 += a[j + 2] * b[j + 2];
+    s3 += a[j + 3] * b[j + 3];
+  }
+  for (; j < VARS; ++j) s0 += a[j] * b[j];
+  return (s0 + s1) + (s2 + s3);
+}
+
+/* DAQP does not survive numbers that are none. */
+static int finite_all(const double *a, int n) {
+  int j, good = 1;
+  for (j = 0; j < n; ++j) good &= fabs(a[j]) <= DBL_MAX;
+  return good;
 }
 
 int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem) {
-  double a[QP_M * VARS + 1], lower[CONS], upper[CONS];
-  double rinv[(VARS + 1) * VARS / 2], m[QP_M * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
+  double a[QP_ROWS * VARS + 1], lower[CONS], upper[CONS], m[QP_ROWS * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
   double lam[VARS + 2], lam_star[VARS + 2], l[(VARS + 2) * (VARS + 3) / 2], d[VARS + 2], xldl[VARS + 2], zldl[VARS + 2];
-  double x[VARS + 1], xold[VARS + 1], primal[VARS], dual[CONS], guess[CONS];
-  int sense[CONS], start[CONS], origin[QP_M + 1], used[QP_M + 1], working[VARS + 2], kept = 0, added, mask, i, j;
+  double x[VARS + 1], xold[VARS + 1], primal[VARS], dual[CONS], guess[CONS], value[QP_ROWS + 1];
+  int sense[CONS], start[CONS], origin[QP_ROWS + 1], used[QP_ROWS + 1], working[VARS + 2], kept = 0, taken = 0, added, good, i;
   DAQPSettings settings;
   DAQPProblem qp;
   DAQPWorkspace work;
@@ -81,20 +91,16 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
   (void)w;
   (void)mem;
 
-  if (!usable(arg)) {
-    for (i = 0; i < VARS && res[0]; ++i) res[0][i] = NAN;
-    for (i = 0; i < CONS && res[1]; ++i) res[1][i] = NAN;
-    return 0;
-  }
   memset(&work, 0, sizeof work);
+  memset(&qp, 0, sizeof qp);
   daqp_default_settings(&settings);
   settings.primal_tol = QP_TOLERANCE;
   result.x = primal;
   result.lam = dual;
+  result.exitflag = 1;
   qp.n = work.n = VARS;
-  qp.ms = work.ms = VARS;
-  qp.H = (double *)arg[0];
-  qp.f = (double *)arg[1];
+  qp.ms = work.ms = QP_SLACKS;
+  qp.f = (double *)arg[0];
   qp.A = a;
   qp.bupper = upper;
   qp.blower = lower;
@@ -103,7 +109,6 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
   work.M = m;
   work.dupper = dupper;
   work.dlower = dlower;
-  work.Rinv = rinv;
   work.v = v;
   work.sense = sense;
   work.scaling = scaling;
@@ -118,38 +123,45 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
   work.WS = working;
   work.settings = &settings;
 
-  for (i = 0; i < CONS; ++i) start[i] = 0;
-  for (i = 0; i < VARS; ++i) {
-    guess[i] = arg[6][i];
-    lower[i] = arg[4][i] < -DAQP_INF ? -DAQP_INF : arg[4][i];
-    upper[i] = arg[5][i] > DAQP_INF ? DAQP_INF : arg[5][i];
+  good = finite_all(arg[0], VARS);
+  for (i = 0; i < QP_SLACKS; ++i) {
+    lower[i] = 0.0;
+    upper[i] = DAQP_INF;
+    guess[i] = arg[4][i];
   }
-  for (i = 0; i < QP_M; ++i) {
-    used[i] = arg[6][VARS + i] > 0.0;
-    if (used[i]) {
-      for (j = 0; j < VARS; ++j) a[kept * VARS + j] = arg[2][j * QP_M + i];
-      guess[VARS + kept] = arg[6][VARS + i];
-      origin[kept++] = i;
-    }
+  for (i = 0; i < CONS; ++i) {
+    start[i] = 0;
+    scaling[i] = 1.0;
+  }
+  for (i = 0; i < QP_ROWS; ++i) {
+    good &= arg[2][i] <= arg[3][i];
+    used[i] = arg[4][QP_SLACKS + i] > 0.0 || arg[4][QP_SLACKS + i] < 0.0 || arg[2][i] >= arg[3][i];
   }
 
-  mask = UPDATE_ALL;
   do {
-    qp.m = work.m = VARS + kept;
-    for (i = mask == UPDATE_ALL ? 0 : VARS; i < VARS + kept; ++i) scaling[i] = 1.0;
-    for (i = 0; i < kept; ++i) {
-      lower[VARS + i] = -DAQP_INF;
-      upper[VARS + i] = arg[3][origin[i]];
+    /* The rows in use that stand not yet in the problem. */
+    for (i = 0; i < QP_ROWS && good; ++i) {
+      const int k = QP_SLACKS + kept;
+      if (used[i] != 1) continue;
+      memcpy(a + kept * VARS, arg[1] + i * VARS, VARS * sizeof *a);
+      lower[k] = arg[2][i] < -DAQP_INF ? -DAQP_INF : arg[2][i];
+      upper[k] = arg[3][i] > DAQP_INF ? DAQP_INF : arg[3][i];
+      guess[k] = taken ? 0.0 : arg[4][QP_SLACKS + i];
+      good = finite_all(a + kept * VARS, VARS);
+      used[i] = 2;
+      origin[kept++] = i;
     }
-    memset(m, 0, kept * VARS * sizeof *m);
+    if (!good) break;
+    taken = 1;
+    qp.m = work.m = QP_SLACKS + kept;
+    for (i = QP_SLACKS; i < QP_SLACKS + kept; ++i) scaling[i] = 1.0;
     reset_daqp_workspace(&work);
-    result.exitflag = update_ldp(mask, &work);
+    result.exitflag = update_ldp(UPDATES, &work);
     if (result.exitflag < 0) break;
-    mask = UPDATE_ROWS;
     start_from(&work, guess);
     if (work.sing_ind != EMPTY_IND) {
       /* Dependent guesses: start from nothing. */
-      for (i = 0; i < VARS + kept; ++i)
+      for (i = 0; i < QP_SLACKS + kept; ++i)
         if (!(sense[i] & IMMUTABLE)) sense[i] &= ~(ACTIVE + LOWER);
       reset_daqp_workspace(&work);
       start_from(&work, NULL);
@@ -157,25 +169,21 @@ int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem)
     daqp_solve(&result, &work);
     if (result.exitflag <= 0) break;
 
-    memcpy(guess, dual, (VARS + kept) * sizeof *guess);
+    memcpy(guess, dual, (QP_SLACKS + kept) * sizeof *guess);
     added = 0;
-    for (i = 0; i < QP_M; ++i) {
-      double value = 0.0;
-      if (used[i]) continue;
-      for (j = 0; j < VARS; ++j) value += arg[2][j * QP_M + i] * primal[j];
-      if (value <= arg[3][i] + ROW_TOLERANCE) continue;
-      for (j = 0; j < VARS; ++j) a[kept * VARS + j] = arg[2][j * QP_M + i];
-      guess[VARS + kept] = 0.0;
-      used[i] = 1;
-      origin[kept++] = i;
-      added = 1;
+    for (i = 0; i < QP_ROWS; ++i) {
+      value[i] = dot(arg[1] + i * VARS, primal);
+      if (used[i] || (value[i] <= arg[3][i] + ROW_TOLERANCE && value[i] >= arg[2][i] - ROW_TOLERANCE)) continue;
+      used[i] = added = 1;
     }
   } while (added);
 
-  for (i = 0; i < VARS && res[0]; ++i) res[0][i] = result.exitflag > 0 ? primal[i] : NAN;
+  good &= result.exitflag > 0;
+  for (i = 0; i < QP_ROWS && res[0]; ++i) res[0][i] = good ? value[i] : NAN;
   if (res[1]) {
-    for (i = 0; i < CONS; ++i) res[1][i] = result.exitflag > 0 ? 0.0 : NAN;
-    for (i = 0; i < VARS + kept && result.exitflag > 0; ++i) res[1][i < VARS ? i : VARS + origin[i - VARS]] = dual[i];
+    for (i = 0; i < CONS; ++i) res[1][i] = good ? 0.0 : NAN;
+    for (i = 0; i < QP_SLACKS && good; ++i) res[1][i] = dual[i];
+    for (i = 0; i < kept && good; ++i) res[1][QP_SLACKS + origin[i]] = dual[QP_SLACKS + i];
   }
   return 0;
 }

@@ -1,7 +1,7 @@
 """The controller's problem, discretised, condensed and scaled, as CasADi functions of run-time values only.
 
 The states are eliminated (single shooting); the inputs U = (u_0 .. u_{N-1}) remain. ``sweep`` rolls the model out and
-linearises it stage by stage; ``quadratic`` condenses that to a dense QP in the scaled step v = (U+ - U) / range and
+linearises it stage by stage; ``quadratic`` condenses that to a dense QP for the scaled step v = (U+ - U) / range and
 the scaled slacks; ``residual`` measures optimality from the same linearisation without condensing it.
 """
 
@@ -34,7 +34,8 @@ class Problem:
     sweep
         (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
     quadratic
-        (U, c, D, lower, upper) -> (H, g, A, uba, lbx, ubx, span, gamma): the scaled QP, with dU = span v, cost gamma J.
+        (U, c, D, lower, upper) -> (g, A', lba, uba, span, gamma): the QP of `control.qp`, one slack a limit. Its first N nu
+        rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J.
     residual
         (U, c, D, multipliers, gamma, lower, upper) -> largest natural residual of the scaled optimality conditions.
     merit
@@ -63,11 +64,6 @@ class Problem:
     def size(self) -> int:
         """Number of decision variables N nu."""
         return int(self.sweep.size1_in(1))
-
-    @property
-    def variables(self) -> int:
-        """Variables of the QP: inputs and one slack a limit."""
-        return self.size + len(self.controller.limits)
 
     @property
     def row_width(self) -> int:
@@ -230,6 +226,15 @@ def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, hori
 
 
 def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
+    """The QP by a Riccati recursion, in coordinates that make its Hessian the identity.
+
+    With B = f_u range, stage Hessians [Q C'; C R] times gamma and P the cost to go, backwards
+
+        r'r = R + B'P B,   h = r^-T (C + B'P A),   P <- Q + A'P A - h'h,   g = r^-T (l_u + B'p),   p <- l_x + A'p - h'g
+
+    the cost is sum_i |e_i|^2 / 2 + g_i'e_i with e_i = r v_i + h dx_i. Forwards v_i = r^-1 (e_i - h dx_i) makes the bounds
+    and rows lower triangular in e. That costs N^2 operations where condensing and factorising the Hessian costs N^3.
+    """
     horizon, limits = controller.horizon, controller.limits
     nu = len(controller.model.inputs)
     size = horizon * nu
@@ -237,51 +242,56 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
     rows, vector = ca.SX.sym("c", len(groups)), ca.SX.sym("D", horizon * stage.length + final.length)
     stages, last = _derivatives(vector, stage, final, horizon)
     span = _span(lower, upper)
-    ranges = _blocks(span, nu)
+    ranges = [ca.diag(block) for block in _blocks(span, nu)]
 
-    # Forward: sensitivity[k] of the state to block k, and the rows' Jacobian from it.
-    sensitivity: list[Any] = []
-    history, jacobian = [], []
-    for i, (f_x, f_u, c_x, c_u, *_) in enumerate(stages):
-        scale = ca.diag(ranges[i])
-        history.append(list(sensitivity))
+    # gamma makes the mean of the Hessian's diagonal one.
+    weight, total = last[6], ca.SX(0)
+    for scale, (f_x, f_u, _, _, _, _, l_xx, _, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
+        total += ca.trace(ca.densify(ca.mtimes([scale, l_uu + ca.mtimes([f_u.T, weight, f_u]), scale])))
+        weight = l_xx + ca.mtimes([f_x.T, weight, f_x])
+    gamma = 1 / ca.fmax(total / size, 1e-12)
+
+    costate, weight = gamma * last[4], gamma * last[6]
+    gradient: list[Any] = []
+    laws: list[tuple[Any, Any]] = []
+    for scale, (f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
+        into = ca.mtimes(f_u, scale)
+        ahead = ca.mtimes(into.T, weight)
+        curved = gamma * ca.mtimes([scale, l_uu, scale]) + ca.mtimes(ahead, into) + REGULARISATION * ca.SX.eye(nu)
+        inverse = ca.solve(ca.chol(ca.densify(curved)), ca.SX.eye(nu))
+        law = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_ux) + ca.mtimes(ahead, f_x))
+        slope = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_u) + ca.mtimes(into.T, costate))
+        costate = gamma * l_x + ca.mtimes(f_x.T, costate) - ca.mtimes(law.T, slope)
+        weight = gamma * l_xx + ca.mtimes([f_x.T, weight, f_x]) - ca.mtimes(law.T, law)
+        gradient.insert(0, slope)
+        laws.insert(0, (inverse, law))
+
+    # states[k]: sensitivity of the state to block k of e.
+    states: list[Any] = []
+    bounds, jacobian = [], []
+    for i, (scale, (inverse, law), (f_x, f_u, c_x, c_u, *_)) in enumerate(zip(ranges, laws, stages, strict=True)):
+        moves = [*(-ca.mtimes(inverse, ca.mtimes(law, s)) for s in states), inverse]
+        into, seen = ca.mtimes(f_u, scale), ca.mtimes(c_u, scale)
+        states.append(ca.SX(f_x.shape[0], nu))
+        bounds.append(ca.horzcat(*moves, ca.SX(nu, size - (i + 1) * nu)))
         jacobian.append(
-            ca.horzcat(*(ca.mtimes(c_x, s) for s in sensitivity), ca.mtimes(c_u, scale), ca.SX(c_x.shape[0], size - (i + 1) * nu))
+            ca.horzcat(
+                *(ca.mtimes(c_x, s) + ca.mtimes(seen, m) for s, m in zip(states, moves, strict=True)),
+                ca.SX(c_x.shape[0], size - (i + 1) * nu),
+            )
         )
-        sensitivity = [*(ca.mtimes(f_x, s) for s in sensitivity), ca.mtimes(f_u, scale)]
-    jacobian.append(ca.horzcat(*(ca.mtimes(last[2], s) for s in sensitivity)))
+        states = [ca.mtimes(f_x, s) + ca.mtimes(into, m) for s, m in zip(states, moves, strict=True)]
+    jacobian.append(ca.horzcat(*(ca.mtimes(last[2], s) for s in states)))
 
-    # Backward: costates for the gradient, and for the Hessian one column of costates for each block of inputs.
-    hessian = ca.SX(size, size)
-    gradient: list[Any] = [None] * horizon
-    costate, columns = last[4], [ca.mtimes(last[6], s) for s in sensitivity]
-    for i in reversed(range(horizon)):
-        f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu = stages[i]
-        scale, own = ca.diag(ranges[i]), slice(i * nu, (i + 1) * nu)
-        gradient[i] = ca.mtimes(scale, l_u + ca.mtimes(f_u.T, costate))
-        costate = l_x + ca.mtimes(f_x.T, costate)
-        hessian[own, own] = ca.mtimes([scale, l_uu, scale]) + ca.mtimes([scale, f_u.T, columns[i]])
-        for k in range(i):
-            block = ca.mtimes(scale, ca.mtimes(f_u.T, columns[k]) + ca.mtimes(l_ux, history[i][k]))
-            hessian[own, k * nu : (k + 1) * nu] = block
-            hessian[k * nu : (k + 1) * nu, own] = block.T
-        columns = [ca.mtimes(f_x.T, columns[k]) + ca.mtimes(l_xx, history[i][k]) for k in range(i)]
-
-    mean = ca.sum1(ca.diag(ca.densify(hessian))) / size
-    gamma = 1 / ca.fmax(mean, 1e-12)
-    weights = gamma * ca.vertcat(*(limit.penalty * limit.scale for limit in limits)) if limits else ca.SX(0, 1)
-    choose = ca.SX(len(groups), len(limits))
+    root = ca.sqrt(gamma * ca.vertcat(*(limit.penalty * limit.scale for limit in limits))) if limits else ca.SX(0, 1)
+    slacks = ca.SX(size + len(groups), len(limits))
     for i, j in enumerate(groups):
-        choose[i, j] = -1
-    curved = gamma * hessian + REGULARISATION * ca.SX.eye(size)
-    unbounded = ca.SX(ca.DM(np.full(len(limits), np.inf)))
+        slacks[size + i, j] = -1 / root[j]
     data = [
-        ca.diagcat(curved, ca.diag(weights)) if limits else curved,
-        ca.vertcat(gamma * ca.vertcat(*gradient), weights),
-        ca.horzcat(ca.vertcat(*jacobian), choose),
-        -rows,
-        ca.vertcat((lower - inputs) / span, ca.SX(ca.DM.zeros(len(limits)))),
-        ca.vertcat((upper - inputs) / span, unbounded),
+        ca.vertcat(root, *gradient),
+        ca.horzcat(slacks, ca.vertcat(*bounds, *jacobian)).T,
+        ca.vertcat((lower - inputs) / span, ca.SX(ca.DM(np.full(len(groups), -np.inf)))),
+        ca.vertcat((upper - inputs) / span, -rows),
         span,
         gamma,
     ]

@@ -83,20 +83,20 @@ def cold(problem: Problem, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _duals(problem: Problem) -> int:
-    return problem.variables + len(problem.groups)
+    return len(problem.controller.limits) + problem.size + len(problem.groups)
 
 
 def _shift(problem: Problem) -> list[int]:
     """Where each entry of the next ``warm`` stands in this one: a stage later, the last stage repeated."""
     nu, horizon, size = len(problem.controller.model.inputs), problem.controller.horizon, problem.size
-    width = problem.row_width
+    bounds, width = size + len(problem.controller.limits), problem.row_width
 
     def later(offset: int, block: int) -> list[int]:
         return [offset + min(i + 1, horizon - 1) * block + k for i in range(horizon) for k in range(block)]
 
-    first_row = size + problem.variables
+    first_row = bounds + size
     terminal = range(first_row + horizon * width, first_row + len(problem.groups))
-    return [*later(0, nu), *later(size, nu), *range(2 * size, first_row), *later(first_row, width), *terminal]
+    return [*later(0, nu), *range(size, bounds), *later(bounds, nu), *later(first_row, width), *terminal]
 
 
 def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
@@ -109,12 +109,12 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     merit, dual, q = ca.MX.sym("merit"), ca.MX.sym("dual", _duals(problem)), ca.MX.sym("q", nq)
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
     *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper)
-    solution, new_dual = qp(problem.variables, rows)(*data, dual)
+    values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
     allowed = merit + KKT_TOLERANCE**2 / gamma + rounding
-    point = list(_line_search(problem)(now, inputs, span * solution[: problem.size], 1.0, allowed, q))
-    kkt = problem.residual(*point[:3], new_dual[problem.variables :], gamma, lower, upper)
+    point = list(_line_search(problem)(now, inputs, span * values[: problem.size], 1.0, allowed, q))
+    kkt = problem.residual(*point[:3], new_dual[len(limits) + problem.size :], gamma, lower, upper)
     return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q], [*point, new_dual, kkt])
 
 

@@ -155,7 +155,7 @@ def _compiled(controller: Controller, plant: SimulatedPlant, indices: tuple[int,
     episode, prepare = _built(controller, plant, indices, steps, daqp_warm)
     generator = ca.CodeGenerator("episode", {"with_header": False})
     generator.add(episode)
-    sources, defines = warm_sources(problem.variables, len(problem.groups))
+    sources, defines = warm_sources(len(controller.limits), problem.size, problem.size + len(problem.groups))
     library = compile_library("episode", (generator.dump(), *sources), defines)
     return ca.external("episode", str(library)), prepare
 
