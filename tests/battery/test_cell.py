@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell import Cell, default_cell, load_cell, mismatched
+from chargetune.battery.thermal import Anode, Thermal
 
 NINE = tuple(i / 10 for i in range(1, 10))
 NAN, INF, YES = math.nan, math.inf, True
@@ -21,6 +22,13 @@ def changed(values, index, value):
 
 
 CELL = default_cell()
+FULL = replace(
+    CELL,
+    R2_ohm=(0.01,) * 9,
+    C2_F=(3e4,) * 9,
+    thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1, factor_K=(273.15, 298.15, 323.15), factor=(2.0, 1.0, 0.6)),
+    anode=Anode((0.0, 0.5, 1.0), (0.3, 0.12, 0.08), (0.01, 0.01, 0.012)),
+)
 
 # Field, its bad value -> what the message must say besides the field.
 REFUSED = [
@@ -146,15 +154,23 @@ def test_mismatch_is_that_of_the_reference(cell, shared, seed):
 
 
 def toml(cell, **changes):
-    data = asdict(cell)
+    data = {k: v for k, v in asdict(cell).items() if v or k == "remark"}
     tables = {
-        "ecm": {k: data.pop(k) for k in ("soc", "R0_ohm", "R1_ohm", "C1_F")},
+        "ecm": {k: data.pop(k) for k in ("soc", *cell.tables)},
         "ocv": {"soc": data.pop("ocv_soc"), "V": data.pop("ocv_V")},
     }
+    tables |= {k: data.pop(k) for k in ("thermal", "anode") if k in data}
     lines = [f"{k} = {json.dumps(v)}" for k, v in (data | changes).items() if v is not None]
     for table, values in tables.items():
         lines += [f"[{table}]", *(f"{k} = {json.dumps(v)}" for k, v in values.items())]
     return "\n".join(lines)
+
+
+def test_a_file_with_all_its_tables_there_and_back(cell, tmp_path):
+    path = tmp_path / "cell.toml"
+    path.write_text(toml(FULL))
+    assert load_cell(path) == FULL
+    assert (cell.pairs, FULL.pairs) == ((1,), (1, 2))
 
 
 def test_a_file_there_and_back(cell, tmp_path):
@@ -171,6 +187,10 @@ def test_a_file_there_and_back(cell, tmp_path):
         (lambda text: text.replace("capacity_Ah = 2.0", "capacity_Ah = 2,0"), ("not valid TOML",)),
         (lambda text: text.replace("capacity_Ah", "capacity_mAh"), ("missing ['capacity_Ah']", "unknown ['capacity_mAh']")),
         (lambda text: text.replace("R0_ohm", "R0_Ohm"), ("table [ecm]", "missing ['R0_ohm']", "unknown ['R0_Ohm']")),
+        (lambda text: text + "\n[thermal]\ncooling_W_K = 1", ("table [thermal]", "missing ['heat_capacity_J_K']")),
+        (lambda text: text + "\n[thermal]\ncooling_W_K = 1\nheat_capacity_J_K = 50\nambient_K = 25", ("ambient_K = 25", "degC")),
+        (lambda text: text + "\n[anode]\nsoc = [0, 1]\npotential_V = [0.2]\nresistance_ohm = [0.1]", ("have 2, 1 and 1 values",)),
+        (lambda text: text.replace("[ocv]", "R2_ohm = [0.01]\n[ocv]"), ("R2_ohm and C2_F are given together",)),
         (lambda text: text.replace("capacity_Ah = 2.0", "capacity_Ah = true"), ("capacity_Ah = True", "finite number")),
         (lambda text: text.replace("capacity_Ah = 2.0", 'capacity_Ah = "2.0"'), ("capacity_Ah = '2.0'", "finite number")),
         (lambda text: text.replace("capacity_Ah = 2.0", "capacity_Ah = nan"), ("capacity_Ah = nan", "finite number")),

@@ -1,11 +1,11 @@
-"""Cell: capacity, limits and circuit tables of one cell, as data that has been checked."""
+"""Cell: capacity, limits, circuit tables and thermal data of one cell, as data that has been checked."""
 
 from __future__ import annotations
 
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +13,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Cell", "default_cell", "load_cell", "mismatched"]
+from chargetune.battery.thermal import Anode, Thermal
+
+__all__ = ["PAIRS_MAX", "Cell", "default_cell", "load_cell", "mismatched"]
+
+# R-C pairs of a circuit; more cannot be told apart in measured pulses.
+PAIRS_MAX = 3
 
 # What a single cell can be. Outside these a unit was mistaken: the bounds are wide on purpose.
 CAPACITY_MAX_AH = 1000.0
@@ -25,8 +30,10 @@ VOLTAGE_ABOVE_FULL_V = 0.1
 
 @dataclass(frozen=True)
 class Cell:
-    """An R-RC cell. Tables over SOC in 0..1: ``soc`` for R0 (ohm), R1 (ohm), C1 (F); ``ocv_soc`` for the OCV (V).
+    """A cell as R0 and one to three R-C pairs.
 
+    Tables over SOC in 0..1: ``soc`` for R0 (ohm), R1 (ohm), C1 (F) and, where there are more pairs, R2, C2, R3, C3;
+    ``ocv_soc`` for the OCV (V). ``thermal`` adds a lumped temperature, ``anode`` a table of the anode potential.
     Charge-positive current. Raises ValueError that names the field, its value and what is allowed.
     """
 
@@ -43,9 +50,26 @@ class Cell:
     ocv_soc: tuple[float, ...]
     ocv_V: tuple[float, ...]
     remark: str = ""
+    R2_ohm: tuple[float, ...] = ()
+    C2_F: tuple[float, ...] = ()
+    R3_ohm: tuple[float, ...] = ()
+    C3_F: tuple[float, ...] = ()
+    thermal: Thermal | None = None
+    anode: Anode | None = None
+
+    @property
+    def pairs(self) -> tuple[int, ...]:
+        """Numbers of the R-C pairs that the cell has: (1,), (1, 2) or (1, 2, 3)."""
+        return tuple(k for k in range(1, PAIRS_MAX + 1) if getattr(self, f"R{k}_ohm"))
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """Names of the circuit's tables over ``soc``: R0_ohm, R1_ohm, C1_F and so on."""
+        return ("R0_ohm", *(name for k in self.pairs for name in _pair(k)))
 
     def __post_init__(self) -> None:
-        for name in ("soc", "R0_ohm", "R1_ohm", "C1_F", "ocv_soc", "ocv_V"):
+        self._check_pairs()
+        for name in ("soc", *self.tables, "ocv_soc", "ocv_V"):
             values = getattr(self, name)
             for i, value in enumerate(values):
                 _number(f"{name}[{i}]", value)
@@ -64,12 +88,12 @@ class Cell:
         _soc_table("ocv_soc", self.ocv_soc, least=4)
         if self.ocv_soc[0] > 0.0 or self.ocv_soc[-1] < 1.0:
             raise ValueError(f"cell: ocv_soc = {self.ocv_soc[0]:g}..{self.ocv_soc[-1]:g} must cover 0..1")
-        for name in ("R0_ohm", "R1_ohm", "C1_F"):
+        for name in self.tables:
             values = getattr(self, name)
             if len(values) != len(self.soc):
                 raise ValueError(f"cell: {name} has {len(values)} values, expected {len(self.soc)}, one for each entry of soc")
             for i, value in enumerate(values):
-                if name == "C1_F":
+                if name.startswith("C"):
                     _within(f"{name}[{i}]", value, 0.0, 1e7, "F")
                 else:
                     _within(f"{name}[{i}]", value, 0.0, RESISTANCE_MAX_OHM, "ohm", hint="was it given in milliohm?")
@@ -85,6 +109,11 @@ class Cell:
             why = f"{VOLTAGE_ABOVE_FULL_V:g} V above the OCV of the full cell"
             raise ValueError(f"cell: voltage_max_V = {self.voltage_max_V:g}, allowed is at most {most:g} V, {why}")
 
+    def _check_pairs(self) -> None:
+        for k in range(2, PAIRS_MAX + 1):
+            if bool(getattr(self, f"R{k}_ohm")) != bool(getattr(self, f"C{k}_F")) or (k in self.pairs and k - 1 not in self.pairs):
+                raise ValueError(f"cell: R{k}_ohm and C{k}_F are given together, and only after pair {k - 1}")
+
 
 def load_cell(path: str | Path) -> Cell:
     """Read a cell file (TOML). Raises ValueError naming the file and the field at fault, FileNotFoundError."""
@@ -97,10 +126,10 @@ def default_cell() -> Cell:
 
 
 def mismatched(cell: Cell, seed: int) -> Cell:
-    """The cell as a wrong controller believes it: R0, R1, C1 each times 1 + U(-0.5, 0.5), drawn in this order from the seed."""
+    """The cell as a wrong controller believes it: R0, R1, C1, R2, C2, .. each times 1 + U(-0.5, 0.5), drawn in this order from the seed."""
     draw = np.random.default_rng(seed)
     changed: dict[str, tuple[float, ...]] = {}
-    for name in ("R0_ohm", "R1_ohm", "C1_F"):
+    for name in cell.tables:
         values = np.array(getattr(cell, name))
         changed[name] = tuple(values * (1 + draw.uniform(-0.5, 0.5, values.size)))
     return replace(cell, **changed)  # type: ignore[arg-type]
@@ -113,19 +142,37 @@ def _read(content: bytes, where: str) -> Cell:
         raise ValueError(f"cell file {where} is not valid TOML: {error}") from error
     top = ("name", "capacity_Ah", "coulombic_efficiency", "current_max_A", "voltage_min_V", "voltage_max_V")
     tables = {"ecm": ("soc", "R0_ohm", "R1_ohm", "C1_F"), "ocv": ("soc", "V")}
-    _keys(data, {*top, *tables}, {"remark"}, where)
+    more = {"ecm": {name for k in range(2, PAIRS_MAX + 1) for name in _pair(k)}}
+    parts = {"thermal": Thermal, "anode": Anode}
+    _keys(data, {*top, *tables}, {"remark", *parts}, where)
     for name, keys in tables.items():
-        if not isinstance(data[name], Mapping):
-            raise ValueError(f"cell file {where}: {name} = {data[name]!r}, expected a table [{name}]")
-        _keys(data[name], set(keys), set(), f"{where}, table [{name}]")
-        for key in keys:
-            if not isinstance(data[name][key], list):
-                raise ValueError(f"cell file {where}: {name}.{key} = {data[name][key]!r}, expected a list of numbers")
-    fields: dict[str, Any] = {key: data[key] for key in top} | {key: tuple(data["ecm"][key]) for key in tables["ecm"]}
+        _keys(_table(data, name, where), set(keys), more.get(name, set()), f"{where}, table [{name}]")
+        for key, value in data[name].items():
+            if not isinstance(value, list):
+                raise ValueError(f"cell file {where}: {name}.{key} = {value!r}, expected a list of numbers")
+    given: dict[str, Any] = {key: data[key] for key in top} | {key: tuple(value) for key, value in data["ecm"].items()}
     try:
-        return Cell(**fields, ocv_soc=tuple(data["ocv"]["soc"]), ocv_V=tuple(data["ocv"]["V"]), remark=str(data.get("remark", "")))
+        for name, make in parts.items():
+            if name in data:
+                known = {f.name for f in fields(make)}
+                needed = {f.name for f in fields(make) if f.default is MISSING}
+                _keys(_table(data, name, where), needed, known - needed, f"{where}, table [{name}]")
+                given[name] = make(**{key: tuple(v) if isinstance(v, list) else v for key, v in data[name].items()})
+        return Cell(**given, ocv_soc=tuple(data["ocv"]["soc"]), ocv_V=tuple(data["ocv"]["V"]), remark=str(data.get("remark", "")))
     except ValueError as error:
-        raise ValueError(f"cell file {where}: {error}") from error
+        message = str(error)
+        raise ValueError(message if message.startswith("cell file") else f"cell file {where}: {message}") from error
+
+
+def _table(data: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    if not isinstance(data[name], Mapping):
+        raise ValueError(f"cell file {where}: {name} = {data[name]!r}, expected a table [{name}]")
+    table: Mapping[str, Any] = data[name]
+    return table
+
+
+def _pair(k: int) -> tuple[str, str]:
+    return f"R{k}_ohm", f"C{k}_F"
 
 
 def _keys(data: Mapping[str, Any], needed: set[str], optional: set[str], where: str) -> None:
