@@ -138,7 +138,7 @@ def test_profile_has_the_worst_excess():
 def test_no_score_from_a_missing_measurement(by_hand, field, value):
     broken = getattr(by_hand, field).copy()
     broken[2, 0] = value
-    with pytest.raises(ValueError, match="no score: a measured voltage or SOC is missing or not finite"):
+    with pytest.raises(ValueError, match="no score: a measurement of voltage_V, soc is missing or not finite"):
         problem(soc_start=0.7).score(replace(by_hand, **{field: broken}))
 
 
@@ -159,7 +159,7 @@ def test_a_call_without_score_keeps_the_episode(by_hand):
     broken[2, 0] = NAN
     p = problem(soc_start=0.7)
     for episode, said in (
-        (replace(by_hand, output_end=broken), "sensor: the episode has no score: a measured voltage or SOC is missing or not finite"),
+        (replace(by_hand, output_end=broken), "sensor: the episode has no score: a measurement of voltage_V, soc is missing or not finite"),
         (by_hand.cut(2, Ending.SOLVER, "no input"), "solver: no input"),
     ):
         p.__dict__["_episodes"] = Recorded(episode)
@@ -270,7 +270,7 @@ def test_refuses(changes, said):
         (lambda: Backoff(upper_V=200), ("backoff: upper_V = 200", "(0, 1] V")),
         (lambda: Backoff(upper_V="0,2"), ("backoff: upper_V = '0,2'", "(0, 1] V")),
         (lambda: Backoff(at="start"), ("backoff: at = 'start'", "'measured' or 'predicted'")),
-        (lambda: ResistanceRatio("R2"), ("of = 'R2'", "'R0' or 'R1'")),
+        (lambda: ResistanceRatio("R9"), ("of = 'R9'", "'R0' or 'R1'")),
         (lambda: ResistanceRatio("R1", lower=0.0), ("resistance ratio of R1: lower = 0.0", "[0.001, 0.999]")),
         (lambda: ResistanceRatio("R1", lower=1.0), ("resistance ratio of R1: lower = 1.0", "[0.001, 0.999]")),
         (lambda: ResistanceRatio("R1", lower=-0.1), ("resistance ratio of R1: lower = -0.1", "[0.001, 0.999]")),

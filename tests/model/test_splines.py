@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from chargetune.model.splines import natural_spline, natural_spline_matrix, pchip
+from chargetune.model.splines import natural_spline, natural_spline_matrix, pchip, piecewise_linear
 
 NODES = [
     [0.0, 1.0],
@@ -35,6 +35,16 @@ def test_pchip_is_that_of_scipy_and_monotone(nodes):
     found = evaluate(pchip, nodes, values, at)
     np.testing.assert_allclose(found, PchipInterpolator(nodes, values)(at), atol=1e-8)
     assert np.all(np.diff(found) > 0)
+
+
+@pytest.mark.parametrize("nodes", NODES)
+def test_piecewise_linear_is_numpys_and_linear_beyond(nodes):
+    values = np.random.default_rng(2).normal(size=len(nodes))
+    at = np.linspace(nodes[0], nodes[-1], 301)
+    np.testing.assert_allclose(evaluate(piecewise_linear, nodes, values, at), np.interp(at, nodes, values), atol=1e-12)
+    beyond = evaluate(piecewise_linear, nodes, values, [nodes[-1] + 0.1])
+    slope = (values[-1] - values[-2]) / (nodes[-1] - nodes[-2])
+    np.testing.assert_allclose(beyond, values[-1] + 0.1 * slope, atol=1e-12)
 
 
 @pytest.mark.parametrize("make", [natural_spline, pchip])

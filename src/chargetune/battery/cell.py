@@ -60,7 +60,7 @@ class Cell:
     @property
     def pairs(self) -> tuple[int, ...]:
         """Numbers of the R-C pairs that the cell has: (1,), (1, 2) or (1, 2, 3)."""
-        return tuple(k for k in range(1, PAIRS_MAX + 1) if getattr(self, f"R{k}_ohm"))
+        return tuple(k for k in range(1, PAIRS_MAX + 1) if len(getattr(self, f"R{k}_ohm")))
 
     @property
     def tables(self) -> tuple[str, ...]:
@@ -111,7 +111,9 @@ class Cell:
 
     def _check_pairs(self) -> None:
         for k in range(2, PAIRS_MAX + 1):
-            if bool(getattr(self, f"R{k}_ohm")) != bool(getattr(self, f"C{k}_F")) or (k in self.pairs and k - 1 not in self.pairs):
+            if bool(len(getattr(self, f"R{k}_ohm"))) != bool(len(getattr(self, f"C{k}_F"))) or (
+                k in self.pairs and k - 1 not in self.pairs
+            ):
                 raise ValueError(f"cell: R{k}_ohm and C{k}_F are given together, and only after pair {k - 1}")
 
 

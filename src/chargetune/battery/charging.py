@@ -2,95 +2,60 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.battery.cell import Cell, mismatched
-from chargetune.battery.ecm import ecm_model
+from chargetune.battery.checks import check_count, check_number
+from chargetune.battery.ecm import ecm_model, overpotentials, start_state
+from chargetune.battery.estimation import Kalman
+from chargetune.battery.limits import HARD_FACTOR, SIGNALS, Kind, Limit
 from chargetune.battery.metrics import charging_metrics
+from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.control.controller import Controller, SoftLimit, Stage
-from chargetune.control.estimators import ExactState, Propagated
+from chargetune.control.estimators import Estimator, ExactState, Propagated
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
-from chargetune.model.splines import natural_spline
+from chargetune.episode.stepwise import run_episode
+from chargetune.model.parameters import ParameterSpace
+from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["Backoff", "ChargingProblem", "ResistanceRatio"]
+__all__ = ["Backoff", "ChargingProblem", "PlantModel", "ResistanceRatio"]
+
+# A violation of a limit that is noticed, in its unit: the solver's tolerance is relative to it.
+NOTICED = {"voltage": 0.1, "temperature": 1.0, "anode": 0.01}
 
 
-@dataclass(frozen=True)
-class Backoff:
-    """theta in the set Y: the controller keeps V <= v_max - b(z), b a natural cubic spline on equidistant SOC nodes.
+class PlantModel(Protocol):
+    """Another plant than the cell's own circuit, as data."""
 
-    ``at="measured"`` takes b at the measured z_k for the whole horizon (the paper's text), ``"predicted"`` at each z_i.
-    A signed backoff (lower < 0) lets the controller also correct a model that is too pessimistic.
-    """
-
-    nodes: int = 7
-    lower_V: float = -0.25
-    upper_V: float = 0.25
-    at: Literal["measured", "predicted"] = "measured"
-
-    def __post_init__(self) -> None:
-        if isinstance(self.nodes, bool) or not isinstance(self.nodes, int) or not 2 <= self.nodes <= 50:
-            raise ValueError(f"backoff: nodes = {self.nodes!r}, allowed is an integer in [2, 50]")
-        _check("backoff: lower_V", self.lower_V, -1.0, 0.0, "V")
-        _check("backoff: upper_V", self.upper_V, 0.0, 1.0, "V", open_low=True)
-        if self.at not in ("measured", "predicted"):
-            raise ValueError(f"backoff: at = {self.at!r}, allowed is 'measured' or 'predicted'")
-
-    @property
-    def grid(self) -> NDArray[np.float64]:
-        return np.linspace(0.0, 1.0, self.nodes)
-
-    @property
-    def parameter(self) -> Parameter:
-        return Parameter("backoff_V", self.lower_V, self.upper_V, 0.0, unit="V", size=self.nodes)
-
-    def voltage(self, stage: Stage) -> Any:
-        z = stage.now["soc"] if self.at == "measured" else stage.x["soc"]
-        return natural_spline(z, self.grid, stage.theta["backoff_V"])
-
-
-@dataclass(frozen=True)
-class ResistanceRatio:
-    """theta in the model f and h: the node values of R0 or R1 as ratio to the controller's (wrong) own, log scale."""
-
-    of: Literal["R0", "R1"]
-    lower: float = 0.1
-    upper: float = 6.0
-
-    def __post_init__(self) -> None:
-        if self.of not in ("R0", "R1"):
-            raise ValueError(f"resistance ratio: of = {self.of!r}, allowed is 'R0' or 'R1'")
-        _check(f"resistance ratio of {self.of}: lower", self.lower, 0.001, 0.999, "")
-        _check(f"resistance ratio of {self.of}: upper", self.upper, 1.001, 100.0, "")
-
-    @property
-    def name(self) -> str:
-        return f"{self.of}_ratio"
-
-    def parameter(self, nodes: int) -> Parameter:
-        return Parameter(self.name, self.lower, self.upper, 1.0, scale="log", size=nodes)
+    def plant(self, soc_start: float, sampling_time_s: float, sensors: Sensors) -> Plant:
+        """A new plant at its start; its outputs are among voltage_V, soc, temperature_K, anode_potential_V."""
+        ...
 
 
 @dataclass(frozen=True)
 class ChargingProblem:
     """Data of one charging study; it pickles small and evaluates theta anywhere.
 
-    plant_cell is the truth, ``mismatch_seed`` makes the controller's belief of it (None: the belief is the truth).
-    ``overpotential``: "model" propagates U1 by the controller's own model, "exact" gives it the plant's.
+    plant_cell is the truth, ``mismatch_seed`` makes the controller's belief of it (None: the belief is the truth); with a
+    ``plant_model`` that is the truth, and plant_cell what is known of it.
+    ``overpotential``: "model" propagates the overpotentials by the controller's own model from a measured SOC, "exact"
+    gives it the plant's; a ``kalman`` filter instead estimates SOC and overpotentials from voltage and current.
+    ``soc_start_error`` is what the controller believes of the SOC at the start less the truth.
     Objective of the paper: G = -sum_{k=0..K} c1 (z_d - z_k)^2 - sum_{k<K} max(0, V_k - v_max)^2, V_k the larger of the
-    voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; the
-    voltage limits are scored on their own, the upper one also in ``soc_windows`` equal parts of the SOC.
+    voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; each limit
+    is scored on its own, upper voltage, temperature and anode potential also in ``soc_windows`` equal parts of the SOC,
+    and as moving mean over ``verdict_samples`` intervals where measurements have noise.
+    Limits that the controller's model predicts are kept by it softly; ``hard`` and ``scored_only`` name the exceptions.
     """
 
     plant_cell: Cell
@@ -112,34 +77,44 @@ class ChargingProblem:
     tolerance_V: float = 5e-4
     soc_windows: int = 5
     sensors: Sensors = field(default_factory=Sensors)
+    plant_model: PlantModel | None = None
+    temperature_max_K: float | None = None
+    anode_min_V: float | None = None
+    tolerance_K: float = 0.05
+    tolerance_anode_V: float = 5e-4
+    hard: tuple[str, ...] = ()
+    scored_only: tuple[str, ...] = ()
+    verdict_samples: int = 1
+    kalman: Kalman | None = None
+    soc_start_error: float = 0.0
+    current_limit: CurrentLimit | None = None
+    limit_backoffs: tuple[LimitBackoff, ...] = ()
+    voltage_spread: MeasurementSpread | None = None
 
     def __post_init__(self) -> None:
         cell = self.plant_cell
         for name in ("current_max_A", "voltage_max_V", "voltage_min_V"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(cell, name))
-        _check("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
-        start = _check("soc_start", self.soc_start, 0.0, 1.0, "")
-        target = _check("soc_target", self.soc_target, 0.0, 1.0, "")
-        least = _check("current_min_A", self.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
-        most = _check("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
-        highest = _check("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
-        lowest = _check("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, "V")
-        _check("penalty_per_V", self.penalty_per_V, 0.0, 1e9, "", open_low=True)
-        _check("c1", self.c1, 0.0, 1.0, "", open_low=True)
-        _check("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")
-        for name, low, high in (("steps", 1, 1_000_000), ("horizon", 1, 50), ("soc_windows", 1, 50)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-                raise ValueError(f"{name} = {value!r}, allowed is an integer in [{low}, {high}]")
+        check_number("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
+        start = check_number("soc_start", self.soc_start, 0.0, 1.0, "")
+        target = check_number("soc_target", self.soc_target, 0.0, 1.0, "")
+        least = check_number("current_min_A", self.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
+        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
+        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
+        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, "V")
+        check_number("penalty_per_V", self.penalty_per_V, 0.0, 1e9, "", open_low=True)
+        check_number("c1", self.c1, 0.0, 1.0, "", open_low=True)
+        check_number("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")
+        for name, count in (("steps", 1_000_000), ("horizon", 50), ("soc_windows", 50), ("verdict_samples", 1000)):
+            check_count(name, getattr(self, name), 1, count)
         seed = self.mismatch_seed
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
             raise ValueError(f"mismatch_seed = {seed!r}, allowed is an integer >= 0")
         if self.overpotential not in ("model", "exact"):
             raise ValueError(f"overpotential = {self.overpotential!r}, allowed is 'model' or 'exact'")
-        tuned = [ratio.of for ratio in self.ratios]
-        if len(set(tuned)) < len(tuned):
-            raise ValueError(f"ratios = {tuned}, allowed is each resistance once")
+        self._check_theta()
+        self._check_limits()
         if least >= most:
             raise ValueError(f"current_min_A = {least:g} must be less than current_max_A = {most:g}")
         if lowest >= highest:
@@ -161,6 +136,50 @@ class ChargingProblem:
             allowed = f"allowed is less than {highest - resting:.3g} V"
             raise ValueError(f"backoff: upper_V = {self.backoff.upper_V:g} V forbids any charging from soc_start; {allowed}")
 
+    def _check_theta(self) -> None:
+        tuned, known = [ratio.of for ratio in self.ratios], ("R0", *(f"R{k}" for k in self.plant_cell.pairs))
+        if len(set(tuned)) < len(tuned) or not set(tuned) <= set(known):
+            raise ValueError(f"ratios = {tuned}, allowed is each resistance once, of {', '.join(known)}")
+        of = [part.of for part in self.limit_backoffs]
+        kept = {limit.of for limit in self.limits if limit.kind != "scored"}
+        if len(set(of)) < len(of) or not set(of) <= kept:
+            raise ValueError(f"limit_backoffs = {of}, allowed is each limit once that the controller's model predicts: {sorted(kept)}")
+        if self.voltage_spread and not self.kalman:
+            raise ValueError("voltage_spread is given without kalman: only a Kalman filter has a spread to tune")
+
+    def _check_limits(self) -> None:
+        if self.temperature_max_K is not None:
+            check_number("temperature_max_K", self.temperature_max_K, 250.0, 400.0, "K (was it given in degC?)")
+        if self.anode_min_V is not None:
+            check_number("anode_min_V", self.anode_min_V, -0.5, 0.5, "V")
+        check_number("tolerance_K", self.tolerance_K, 0.0, 10.0, "K")
+        check_number("tolerance_anode_V", self.tolerance_anode_V, 0.0, 0.1, "V")
+        check_number("soc_start_error", self.soc_start_error, -0.5, 0.5)
+        check_number("believed SOC at the start (soc_start + soc_start_error)", self.soc_start + self.soc_start_error, 0.0, 1.0)
+        names = [limit.name for limit in self.limits]
+        for label in ("hard", "scored_only"):
+            unknown = sorted(set(getattr(self, label)) - set(names))
+            if unknown:
+                raise ValueError(f"{label} names {unknown}, allowed are the limits that are set: {', '.join(names)}")
+        if self.plant_model is None:
+            missing = [limit.name for limit in self.limits if limit.signal not in ecm_model(self.plant_cell).output_names]
+            if missing:
+                raise ValueError(f"{missing} cannot be measured on this cell: it has no [thermal] or [anode] table")
+
+    @cached_property
+    def limits(self) -> tuple[Limit, ...]:
+        """Every limit that is set, in the order of the score."""
+        predicted = {"voltage": True, "temperature": self.plant_cell.thermal is not None, "anode": self.plant_cell.anode is not None}
+        tolerance = {"voltage": self.tolerance_V, "temperature": self.tolerance_K, "anode": self.tolerance_anode_V}
+        out = []
+        for name in SIGNALS:
+            bound, what = getattr(self, name), name.split("_", maxsplit=1)[0]
+            unseen = name in self.scored_only or not predicted[what]
+            kind: Kind = "scored" if unseen else "hard" if name in self.hard else "soft"
+            if bound is not None:
+                out.append(Limit(name, bound, tolerance[what], kind))
+        return tuple(out)
+
     @cached_property
     def controller_cell(self) -> Cell:
         """What the untuned controller believes of the cell."""
@@ -169,26 +188,30 @@ class ChargingProblem:
     @cached_property
     def space(self) -> ParameterSpace:
         nodes = len(self.plant_cell.soc)
-        own = (self.backoff.parameter,) if self.backoff else ()
-        return ParameterSpace((*own, *(ratio.parameter(nodes) for ratio in self.ratios)))
+        parts = (self.backoff, *self.limit_backoffs, self.current_limit, self.voltage_spread)
+        own = [part.parameter for part in parts if part]
+        ratios = [ratio.parameter(nodes) for ratio in self.ratios]
+        return ParameterSpace((*own[:1], *ratios, *own[1:]) if self.backoff else (*ratios, *own))
 
     @cached_property
     def controller(self) -> Controller:
-        backoff, ratios, limit = self.backoff, self.ratios, self.voltage_max_V
+        largest = self.current_max_A or 0.0
 
         def cost(stage: Stage) -> Any:
             return (stage.x_d["soc"] - stage.x["soc"]) ** 2
 
-        def highest(stage: Stage) -> Any:
-            return limit - backoff.voltage(stage) if backoff else limit
-
         def believed(stage: Stage) -> dict[str, Any]:
-            return {f"{r.of}_ohm": stage.p[f"{r.of}_ohm"] * stage.theta[r.name] for r in ratios}
+            changed = {f"{r.of}_ohm": stage.p[f"{r.of}_ohm"] * stage.theta[r.name] for r in self.ratios}
+            return changed | ({"voltage_sd_V": stage.theta["voltage_sd_V"]} if self.voltage_spread else {})
+
+        def most(stage: Stage) -> Any:
+            return largest * self.current_limit.share(stage) if self.current_limit else largest
 
         # Both models come from the same cell, so that the compiled problem is the same for every mismatch.
         belief = self.controller_cell
-        model = ecm_model(self.plant_cell, self.sampling_time_s).with_parameters(
-            R0_ohm=belief.R0_ohm, R1_ohm=belief.R1_ohm, C1_F=belief.C1_F
+        settings = {"voltage_sd_V": self.voltage_spread.default_V} if self.voltage_spread else {}
+        model = ecm_model(self.plant_cell, self.sampling_time_s, settings).with_parameters(
+            **{name: getattr(belief, name) for name in belief.tables}
         )
         return Controller.build(
             model,
@@ -198,48 +221,88 @@ class ChargingProblem:
             terminal_cost=cost,
             parameters=believed,
             input_lower={"current_A": self.current_min_A},
-            input_upper={"current_A": self.current_max_A or 0.0},
-            limits=[SoftLimit("voltage_V", lower=self.voltage_min_V, upper=highest, at="both", penalty=self.penalty_per_V, scale=0.1)],
+            input_upper={"current_A": most},
+            limits=self._soft_limits(),
             fallback={"current_A": max(self.current_min_A, 0.0)},
             setpoint={"soc": self.soc_target},
-            start={"soc": self.soc_start},
-            estimator=Propagated(("soc",)) if self.overpotential == "model" else ExactState(),
+            start=start_state(self.plant_cell, self.soc_start + self.soc_start_error),
+            estimator=self._estimator(),
         )
+
+    def _soft_limits(self) -> list[SoftLimit]:
+        """The limits that the controller sees, upper and lower bound of the same output together."""
+        margins: dict[str, Callable[[Stage], Any]] = {part.of: part.margin for part in self.limit_backoffs}
+        if self.backoff:
+            margins["voltage"] = self.backoff.voltage
+        bounds: dict[str, dict[str, Any]] = {}
+        for limit in self.limits:
+            what = limit.of
+            if limit.kind == "scored":
+                continue
+
+            def bound(stage: Stage, limit: Limit = limit, what: str = what) -> Any:
+                # A backoff of the voltage belongs to its upper limit.
+                margin = margins[what](stage) if what in margins and limit.name != "voltage_min_V" else 0.0
+                return limit.bound - margin if limit.upper else limit.bound + margin
+
+            simple = what not in margins or limit.name == "voltage_min_V"
+            factor = HARD_FACTOR if limit.kind == "hard" else 1.0
+            # One unit of any limit's noticed violation costs the same.
+            penalty = factor * self.penalty_per_V * NOTICED["voltage"] / NOTICED[what]
+            own = bounds.setdefault(limit.signal, {"at": "both", "scale": NOTICED[what], "penalty": penalty})
+            own["penalty"] = max(own["penalty"], penalty)
+            own["upper" if limit.upper else "lower"] = limit.bound if simple else bound
+        return [SoftLimit(signal, **own) for signal, own in bounds.items()]
+
+    def _estimator(self) -> Estimator:
+        thermal = ("temperature_K",) if self.plant_cell.thermal else ()
+        if self.kalman:
+            return self.kalman.estimator(overpotentials(self.plant_cell), thermal=bool(thermal), tuned=self.voltage_spread is not None)
+        return Propagated(("soc", *thermal)) if self.overpotential == "model" else ExactState()
 
     def __getstate__(self) -> dict[str, Any]:
         # What is derived is made anew where the problem arrives, so that it stays small on its way to a worker.
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     @property
-    def plant(self) -> SimulatedPlant:
+    def plant(self) -> Plant:
         """A new plant at its start."""
-        return SimulatedPlant(ecm_model(self.plant_cell, self.sampling_time_s), {"soc": self.soc_start}, self.sensors)
+        if self.plant_model is not None:
+            return self.plant_model.plant(self.soc_start, self.sampling_time_s, self.sensors)
+        cell = self.plant_cell
+        return SimulatedPlant(ecm_model(cell, self.sampling_time_s), start_state(cell, self.soc_start), self.sensors)
 
     def episode(self, theta: ArrayLike | None = None, seed: int = 0) -> Episode:
         """One charge with the controller at theta (None: untuned)."""
-        return self._episodes.run(theta, seed)
+        if self._episodes is not None:
+            return self._episodes.run(theta, seed)
+        return run_episode(self.controller, self.plant, steps=self.steps, theta=theta, seed=seed)
 
     @cached_property
-    def _episodes(self) -> CompiledEpisode:
-        return compiled_episode(self.controller, self.plant, self.steps)
+    def _episodes(self) -> CompiledEpisode | None:
+        plant = self.plant
+        return compiled_episode(self.controller, plant, self.steps) if isinstance(plant, SimulatedPlant) else None
 
     def score(self, episode: Episode) -> Score:
         """The verdict on what was measured. Raises ValueError when a measurement is not a number."""
-        start, end = episode.signal("voltage_V")
         _, soc = episode.signal("soc")
-        highest, lowest = np.maximum(start, end), np.minimum(start, end)
-        above, below = highest - (self.voltage_max_V or 0.0), (self.voltage_min_V or 0.0) - lowest
-        if not (len(soc) and all(np.all(np.isfinite(values)) for values in (start, end, soc))):
-            raise ValueError("the episode has no score: a measured voltage or SOC is missing or not finite")
+        measured = [values for limit in self.limits for values in episode.signal(limit.signal)]
+        if not (len(soc) and all(np.all(np.isfinite(values)) for values in (*measured, soc))):
+            names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
+            raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        over = np.maximum(0.0, above) ** 2
+        excess = {limit.name: limit.excess(episode, self.verdict_samples) for limit in self.limits}
+        over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
+        metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
+        for limit in self.limits[2:]:
+            metrics |= limit.metrics(episode)
         return Score(
             objective=-float(np.mean(deficit)),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
-            excess={"voltage_max_V": float(np.max(above)), "voltage_min_V": float(np.max(below))},
-            tolerance={"voltage_max_V": self.tolerance_V, "voltage_min_V": self.tolerance_V},
-            metrics=charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start),
-            profile={"voltage_max_V": _by_window(soc, above, self.soc_windows)},
+            excess={name: float(np.max(values)) for name, values in excess.items()},
+            tolerance={limit.name: limit.tolerance for limit in self.limits},
+            metrics=metrics,
+            profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
         )
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:
@@ -257,11 +320,3 @@ def _by_window(soc: NDArray[np.float64], excess: NDArray[np.float64], windows: i
     """The worst excess in each of ``windows`` equal parts of 0..1 in SOC; None where no interval ended."""
     index = np.clip((soc * windows).astype(int), 0, windows - 1)
     return tuple(float(np.max(excess[index == i])) if np.any(index == i) else None for i in range(windows))
-
-
-def _check(name: str, value: float | None, low: float, high: float, unit: str, *, open_low: bool = False) -> float:
-    ok = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if not ok or value is None or not (low < value if open_low else low <= value) or value > high:
-        bracket = "(" if open_low else "["
-        raise ValueError(f"{name} = {value!r}, allowed is {bracket}{low:g}, {high:g}] {unit}".rstrip())
-    return float(value)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,10 +14,16 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chargetune.battery.cell import Cell, default_cell, load_cell
-from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRatio
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.estimation import Kalman
+from chargetune.battery.thermal import Anode, Thermal
+from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.plants.sensors import Sensors
 
 __all__ = ["CASE_STUDIES", "Config", "case_study", "load_config", "problem_of_document"]
+
+
+RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
 
 class _Table(BaseModel):
@@ -49,14 +57,41 @@ class ControllerTable(_Table):
     penalty_per_V: float = 1e3
 
 
+class KalmanTable(_Table):
+    """Extended Kalman filter on voltage, current and temperature instead of a measured SOC."""
+
+    voltage_sd_V: float = 0.05
+    temperature_sd_K: float = 0.3
+    soc_start_sd: float = 0.02
+    soc_process_sd: float = 1e-5
+    overpotential_process_sd_V: float = 1e-4
+    temperature_process_sd_K: float = 0.05
+
+
+class EstimatorTable(_Table):
+    """What the controller knows of the state: the error of its SOC at the start, and a filter."""
+
+    soc_start_error: float = 0.0
+    kalman: KalmanTable | None = None
+
+
 class LimitsTable(_Table):
-    """Limits; what is not given comes from the cell."""
+    """Limits; what is not given comes from the cell, or is no limit.
+
+    ``hard`` and ``scored_only`` name limits that the controller keeps at any price, or does not see.
+    """
 
     current_min_A: float = 0.0
     current_max_A: float | None = None
     voltage_min_V: float | None = None
     voltage_max_V: float | None = None
     tolerance_V: float = 5e-4
+    temperature_max_K: float | None = None
+    tolerance_K: float = 0.05
+    anode_min_V: float | None = None
+    tolerance_anode_V: float = 5e-4
+    hard: list[str] = Field(default_factory=list)
+    scored_only: list[str] = Field(default_factory=list)
 
 
 class EpisodeTable(_Table):
@@ -73,16 +108,24 @@ class SensorTable(_Table):
     voltage_noise_sd_V: float = 0.0
     voltage_bias_V: float = 0.0
     voltage_resolution_V: float = 0.0
+    temperature_noise_sd_K: float = 0.0
+    temperature_bias_K: float = 0.0
     soc_noise_sd: float = 0.0
     soc_bias: float = 0.0
     delay_steps: int = 0
 
+    def by_signal(self, what: Literal["noise_sd", "bias"]) -> dict[str, float]:
+        """The errors that are not zero, by signal; a plant need not have the others."""
+        signals = {"voltage_V": f"voltage_{what}_V", "temperature_K": f"temperature_{what}_K", "soc": f"soc_{what}"}
+        return {signal: value for signal, field in signals.items() if (value := getattr(self, field))}
+
 
 class ObjectiveTable(_Table):
-    """c1 of the paper's scalar performance G; SOC windows in which the voltage excess is told to the tuner."""
+    """c1 of the paper's scalar performance G; SOC windows in which an excess is told to the tuner; intervals in its moving mean."""
 
     c1: float = 1e-5
     soc_windows: int = 5
+    verdict_samples: int = 1
 
 
 class BackoffTable(_Table):
@@ -95,10 +138,33 @@ class BackoffTable(_Table):
 
 
 class RatioTable(_Table):
-    """Node values of a resistance as part of theta, as ratio to the controller's own."""
+    """A resistance as part of theta, as ratio to the controller's own: one a node, or ``scale = true`` one for all."""
 
     lower: float = 0.1
     upper: float = 6.0
+    scale: bool = False
+
+
+class CurrentLimitTable(_Table):
+    """Spline nodes of a current limit over SOC as part of theta, as shares of the largest current."""
+
+    nodes: int = 6
+    lower: float = 0.1
+
+
+class LimitBackoffTable(_Table):
+    """A margin to the temperature limit (K) or to the anode potential's (V) as part of theta."""
+
+    lower: float
+    upper: float
+    nodes: int = 1
+
+
+class SpreadTable(_Table):
+    """The voltage's standard deviation in the Kalman filter as part of theta; the default is the filter's own."""
+
+    lower_V: float = 1e-3
+    upper_V: float = 0.2
 
 
 class ThetaTable(_Table):
@@ -107,6 +173,12 @@ class ThetaTable(_Table):
     backoff: BackoffTable | None = None
     R0: RatioTable | None = None
     R1: RatioTable | None = None
+    R2: RatioTable | None = None
+    R3: RatioTable | None = None
+    current_limit: CurrentLimitTable | None = None
+    temperature_backoff: LimitBackoffTable | None = None
+    anode_backoff: LimitBackoffTable | None = None
+    voltage_sd: SpreadTable | None = None
     values: dict[str, float | list[float]] = Field(default_factory=dict)
 
 
@@ -116,6 +188,7 @@ class Config(_Table):
     study: StudyTable = StudyTable()
     cell: CellTable = CellTable()
     controller: ControllerTable = ControllerTable()
+    estimator: EstimatorTable = EstimatorTable()
     limits: LimitsTable = LimitsTable()
     episode: EpisodeTable = EpisodeTable()
     sensors: SensorTable = SensorTable()
@@ -127,23 +200,35 @@ class Config(_Table):
 
         Raises ValueError, FileNotFoundError.
         """
-        theta = self.theta
-        ratios = [ResistanceRatio("R0", theta.R0.lower, theta.R0.upper)] if theta.R0 else []
-        ratios += [ResistanceRatio("R1", theta.R1.lower, theta.R1.upper)] if theta.R1 else []
+        theta, kalman = self.theta, self.estimator.kalman
+        ratios = [ResistanceRatio(of, **table.model_dump()) for of in RESISTANCES if (table := getattr(theta, of))]
+        margins = {"temperature": theta.temperature_backoff, "anode": theta.anode_backoff}
         sensors = Sensors(
-            noise_sd={"voltage_V": self.sensors.voltage_noise_sd_V, "soc": self.sensors.soc_noise_sd},
-            bias={"voltage_V": self.sensors.voltage_bias_V, "soc": self.sensors.soc_bias},
+            noise_sd=self.sensors.by_signal("noise_sd"),
+            bias=self.sensors.by_signal("bias"),
             resolution={"voltage_V": self.sensors.voltage_resolution_V},
             delay_steps=self.sensors.delay_steps,
         )
+        filter_ = Kalman(**kalman.model_dump()) if kalman else None
+        if theta.voltage_sd and filter_ is None:
+            raise ValueError("theta.voltage_sd is given without a table [estimator.kalman]")
         return ChargingProblem(
             plant_cell=cell or self._cell(folder),
             backoff=Backoff(**theta.backoff.model_dump()) if theta.backoff else None,
             ratios=tuple(ratios),
+            limit_backoffs=tuple(LimitBackoff(of, **table.model_dump()) for of, table in margins.items() if table),  # type: ignore[arg-type]
+            current_limit=CurrentLimit(**theta.current_limit.model_dump()) if theta.current_limit else None,
+            voltage_spread=MeasurementSpread(**theta.voltage_sd.model_dump(), default_V=filter_.voltage_sd_V)
+            if theta.voltage_sd and filter_
+            else None,
+            kalman=filter_,
+            soc_start_error=self.estimator.soc_start_error,
             sensors=sensors,
+            hard=tuple(self.limits.hard),
+            scored_only=tuple(self.limits.scored_only),
             **self.objective.model_dump(),
             **self.controller.model_dump(),
-            **self.limits.model_dump(),
+            **self.limits.model_dump(exclude={"hard", "scored_only"}),
             **self.episode.model_dump(),
         )
 
@@ -155,7 +240,7 @@ class Config(_Table):
         """What decides the trials, as JSON data for the store: the cell's numbers instead of its file, without the number of trials."""
         data = self.model_dump(mode="json")
         cell = self._cell(folder)
-        data["cell"] = {name: list(v) if isinstance(v := getattr(cell, name), tuple) else v for name in cell.__dataclass_fields__}
+        data["cell"] = json.loads(json.dumps(asdict(cell)))
         data["theta"].pop("values")
         data["study"] = {"tuner": self.study.tuner}
         return data
@@ -168,9 +253,15 @@ class Config(_Table):
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
-    cell: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in document["cell"].items()}
+    cell = _tuples(document["cell"])
+    for name, make in (("thermal", Thermal), ("anode", Anode)):
+        cell[name] = make(**_tuples(cell[name])) if cell.get(name) else None
     tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
     return Config.model_validate(tables).problem(cell=Cell(**cell))
+
+
+def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
 
 
 def load_config(path: str | Path) -> Config:

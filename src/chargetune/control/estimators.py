@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.model.model import Model
+from chargetune.model.model import Model, Named
 
 __all__ = ["Estimator", "ExactState", "ExtendedKalman", "Propagated", "finite"]
 
@@ -98,12 +98,13 @@ class ExtendedKalman:
     K = P C' (C P C' + R)^-1, x_hat = x + K (y - h(x, u)), P = (I - K C) P, then x = f(x_hat, u), P = A P A' + Q.
     The measurement of index k is the output at the end of interval k - 1, so h is taken with the input applied there
     (zero before the first). ``measurement_sd`` should hold the model's error as well as the sensor's: in fast charging
-    the model error dominates. A sample that is not finite is left out. Outputs are processed one by one, which is exact for a diagonal R.
+    the model error dominates. An entry may be the name of a model parameter, which theta can set. A sample that is not
+    finite is left out. Outputs are processed one by one, which is exact for a diagonal R.
     Source: Plett, Battery Management Systems, vol. 2, ch. 3; Simon, Optimal State Estimation, sec. 6.1 and 13.2.
     """
 
     measured: tuple[str, ...]
-    measurement_sd: tuple[float, ...]
+    measurement_sd: tuple[float | str, ...]
     process_sd: tuple[float, ...]
     start_sd: tuple[float, ...]
 
@@ -113,7 +114,7 @@ class ExtendedKalman:
                 f"estimator: measurement_sd has {len(self.measurement_sd)} values, expected one for each of {list(self.measured)}"
             )
         for name, least in (("measurement_sd", 0.0), ("process_sd", 0.0), ("start_sd", 0.0)):
-            values = getattr(self, name)
+            values = [v for v in getattr(self, name) if not isinstance(v, str)]
             strict = name == "measurement_sd"
             if not all(math.isfinite(v) and (v > least if strict else v >= least) for v in values):
                 raise ValueError(f"estimator: {name} = {list(values)}, allowed are finite numbers {'>' if strict else '>='} 0")
@@ -122,6 +123,9 @@ class ExtendedKalman:
         unknown = sorted(set(self.measured) - set(model.output_names))
         if unknown:
             raise ValueError(f"estimator: measured = {unknown}, allowed are {', '.join(model.output_names)}")
+        named = [sd for sd in self.measurement_sd if isinstance(sd, str)]
+        if any(model.parameter_blocks.get(sd) != 1 for sd in named):
+            raise ValueError(f"estimator: measurement_sd names {named}, allowed are scalar parameters of model {model.name}")
         for name in ("process_sd", "start_sd"):
             if len(getattr(self, name)) != len(model.states):
                 raise ValueError(
@@ -143,7 +147,8 @@ class ExtendedKalman:
             row, value = ca.substitute([ca.jacobian(output, at), output], [at], [x])
             spread = ca.mtimes(covariance, row.T)
             usable = finite(y[name])
-            gain = ca.if_else(usable, 1, 0) * spread / (ca.mtimes(row, spread) + sd**2)
+            noise = Named(model.parameter_blocks, p)[sd] if isinstance(sd, str) else sd
+            gain = ca.if_else(usable, 1, 0) * spread / (ca.mtimes(row, spread) + noise**2)
             x = x + gain * ca.if_else(usable, y[name] - value, 0)
             covariance = covariance - ca.mtimes(gain, spread.T)
         covariance = (covariance + covariance.T) / 2

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-__all__ = ["natural_spline", "natural_spline_matrix", "pchip"]
+__all__ = ["natural_spline", "natural_spline_matrix", "pchip", "piecewise_linear"]
 
 
 def natural_spline_matrix(nodes: ArrayLike) -> NDArray[np.float64]:
@@ -47,6 +47,23 @@ def natural_spline(z: Any, nodes: ArrayLike, values: Any) -> Any:
     for j, node in enumerate(grid):
         t = _positive_part(z - node)
         out += coefficients[2 + j] * (t * t * t)
+    return out
+
+
+def piecewise_linear(z: Any, nodes: ArrayLike, values: Any) -> Any:
+    """Straight lines through (nodes, values) at the CasADi expression z; the outer ones go on beyond the nodes.
+
+    ``values`` may be symbols: the result is linear in them, and between the smallest and the largest within the nodes.
+    """
+    grid = _check_nodes(nodes)
+    column = ca.SX(values) if not isinstance(values, ca.MX) else values
+    if column.shape != (grid.size, 1):
+        raise ValueError(f"values have shape {column.shape}, expected ({grid.size}, 1), one a node")
+    at: list[Any] = ca.vertsplit(column)
+    slopes = [(b - a) / step for a, b, step in zip(at, at[1:], np.diff(grid), strict=False)]
+    out = at[0] + slopes[0] * (z - grid[0])
+    for j in range(1, grid.size - 1):
+        out += (slopes[j] - slopes[j - 1]) * _positive_part(z - grid[j])
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,12 +76,13 @@ def backoff_figure(view: StudyView) -> Figure:
     return figure
 
 
-def resistance_figure(view: StudyView, of: Literal["R0", "R1"]) -> Figure:
-    """R0 or R1 over SOC in milliohm: of the plant, of the untuned and of the tuned controller. Raises ValueError when theta has none."""
+def resistance_figure(view: StudyView, of: str) -> Figure:
+    """A resistance over SOC in milliohm: of plant, untuned and tuned controller. Raises ValueError when theta has none."""
     problem = view.problem
-    if problem is None or of not in [ratio.of for ratio in problem.ratios]:
+    ratios = {ratio.of: ratio for ratio in problem.ratios} if problem else {}
+    if problem is None or of not in ratios:
         raise ValueError(f"study {view.name!r} does not tune {of}")
-    part = view.space.slices[f"{of}_ratio"]
+    part = view.space.slices[ratios[of].name]
     believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
     true = np.array(getattr(problem.plant_cell, f"{of}_ohm"))
     with journal_style():
