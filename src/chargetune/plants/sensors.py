@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -10,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.model.model import Signal
+from chargetune.plants.plant import Measurement
 
-__all__ = ["Sensors"]
+__all__ = ["Readout", "Sensors"]
 
 
 @dataclass(frozen=True)
@@ -45,3 +47,25 @@ class Sensors:
             if unknown:
                 raise ValueError(f"sensors: {field_name} names unknown {unknown}, allowed are {', '.join(names)}")
         return tuple(np.array([float(getattr(self, f).get(n, 0.0)) for n in names]) for f in ("noise_sd", "bias", "resolution"))  # type: ignore[return-value]
+
+
+class Readout:
+    """The sensors of one episode of a plant that is stepped: true outputs in, `Measurement` out.
+
+    A standard normal number is drawn from ``stream`` for each output at both ends of each interval, in order of time.
+    """
+
+    def __init__(self, sensors: Sensors, outputs: tuple[Signal, ...], stream: np.random.Generator) -> None:
+        self._sd, self._bias, self._resolution = sensors.vectors(outputs)
+        self._stream = stream
+        self._sent: deque[NDArray[np.float64]] = deque(maxlen=sensors.delay_steps + 1)
+
+    def read(self, before: NDArray[np.float64], after: NDArray[np.float64], state: NDArray[np.float64] | None = None) -> Measurement:
+        """What is measured of an interval with these true outputs at its two ends; the first call is the plant at rest."""
+        both = np.array([before, after])
+        noise = self._sd * self._stream.standard_normal(both.shape) if self._sd.any() else 0.0
+        raw = both + self._bias + noise
+        step = np.where(self._resolution > 0, self._resolution, 1.0)
+        start, end = np.where(self._resolution > 0, np.floor(raw / step + 0.5) * step, raw)
+        self._sent.extend([end] * (1 if self._sent else self._sent.maxlen or 1))
+        return Measurement(start, end, self._sent[0], before, after, state)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from chargetune.model.model import Model, Signal
 from chargetune.plants.plant import Measurement, PlantError
-from chargetune.plants.sensors import Sensors
+from chargetune.plants.sensors import Readout, Sensors
 
 __all__ = ["SimulatedPlant", "disturbances"]
 
@@ -30,7 +29,7 @@ def disturbances(plant: SimulatedPlant, steps: int, seed: int) -> tuple[NDArray[
     if not sd.any() and not spread.any():
         # Drawing numbers only to multiply them by zero takes a tenth of the time of an episode.
         return errors, process
-    sensor_stream, process_stream = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
+    sensor_stream, process_stream = _streams(seed)
     errors += sd * sensor_stream.standard_normal(errors.shape)
     process += spread * process_stream.standard_normal(process.shape)
     return errors, process
@@ -45,11 +44,9 @@ class SimulatedPlant:
     sensors: Sensors = field(default_factory=Sensors)
     process_noise_sd: Mapping[str, float] = field(default_factory=dict)
     _state: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros(0))
-    _seed: int = field(init=False, repr=False, compare=False, default=0)
     _step: int = field(init=False, repr=False, compare=False, default=0)
-    _sent: deque[NDArray[np.float64]] = field(init=False, repr=False, compare=False, default_factory=deque)
-    _errors: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros((0, 2, 0)))
-    _process: NDArray[np.float64] = field(init=False, repr=False, compare=False, default_factory=lambda: np.zeros((0, 0)))
+    _readout: Readout | None = field(init=False, repr=False, compare=False, default=None)
+    _stream: np.random.Generator | None = field(init=False, repr=False, compare=False, default=None)
 
     def __post_init__(self) -> None:
         for label, names in (("start", self.start), ("process_noise_sd", self.process_noise_sd)):
@@ -83,36 +80,30 @@ class SimulatedPlant:
         return np.array([float(self.process_noise_sd.get(n, 0.0)) for n in self.model.state_names])
 
     def reset(self, seed: int) -> Measurement:
-        self._state, self._seed, self._step = self.start_state, seed, 0
-        self._draw(512)
+        sensor_stream, self._stream = _streams(seed)
+        self._state, self._step = self.start_state, 0
+        self._readout = Readout(self.sensors, self.outputs, sensor_stream)
         rest = np.array(self.model.h(self._state, np.zeros(len(self.inputs)), self.model.nominal)).ravel()
-        start, end = self._measure(rest, rest)
-        self._sent = deque([end] * (self.sensors.delay_steps + 1), maxlen=self.sensors.delay_steps + 1)
-        return Measurement(start, end, self._sent[0], rest, rest, self._state)
+        return self._readout.read(rest, rest, self._state)
 
     def step(self, u: NDArray[np.float64]) -> Measurement:
-        p = self.model.nominal
+        if self._readout is None or self._stream is None:
+            raise PlantError("the plant was not reset before its first step")
+        p, spread = self.model.nominal, self.process_sd
         before = np.array(self.model.h(self._state, u, p)).ravel()
-        if self._step >= len(self._process):
-            self._draw(2 * len(self._process))
-        noise = self._process[self._step]
+        noise = spread * self._stream.standard_normal(spread.shape) if spread.any() else 0.0
         self._state = np.array(self.model.f(self._state, u, p)).ravel() + noise
         after = np.array(self.model.h(self._state, u, p)).ravel()
         if not np.all(np.isfinite(self._state)):
             raise PlantError(f"the plant's state is not finite after step {self._step}: {self._state.tolist()}")
         self._step += 1
-        start, end = self._measure(before, after)
-        self._sent.append(end)
-        return Measurement(start, end, self._sent[0], before, after, self._state)
+        return self._readout.read(before, after, self._state)
 
     def close(self) -> None:
         """Nothing to release."""
 
-    def _draw(self, steps: int) -> None:
-        self._errors, self._process = disturbances(self, steps, self._seed)
 
-    def _measure(self, before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        _, _, resolution = self.sensors.vectors(self.outputs)
-        raw = np.array([before, after]) + self._errors[self._step]
-        rounded = np.where(resolution > 0, np.floor(raw / np.where(resolution > 0, resolution, 1.0) + 0.5) * resolution, raw)
-        return rounded[0], rounded[1]
+def _streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Random numbers of an episode: for the sensors and for the process."""
+    sensors, process = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
+    return sensors, process
