@@ -15,7 +15,7 @@ import numpy as np
 
 from chargetune.battery.thermal import Anode, Thermal
 
-__all__ = ["PAIRS_MAX", "Cell", "default_cell", "load_cell", "mismatched"]
+__all__ = ["PAIRS_MAX", "VOLTAGE_ABOVE_FULL_V", "Cell", "default_cell", "load_cell", "mismatched"]
 
 # R-C pairs of a circuit; more cannot be told apart in measured pulses.
 PAIRS_MAX = 3

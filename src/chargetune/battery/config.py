@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chargetune.battery.cell import Cell, default_cell, load_cell
 from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.estimation import Kalman
 from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
@@ -45,6 +46,18 @@ class CellTable(_Table):
     """The plant's cell; without a file the default cell."""
 
     file: str | None = None
+
+
+class PlantTable(_Table):
+    """Another plant than the cell's own circuit: an electrochemical model; the cell is then what the controller knows."""
+
+    model: Literal["SPM", "SPMe", "DFN"] = "DFN"
+    parameters: str = "OKane2022"
+    ambient_K: float = 298.15
+    cooling_W_m2K: float = 10.0
+    capacity_scale: float = 1.0
+    resistance_scale: float = 1.0
+    mesh: Literal["coarse", "default"] = "coarse"
 
 
 class ControllerTable(_Table):
@@ -187,6 +200,7 @@ class Config(_Table):
 
     study: StudyTable = StudyTable()
     cell: CellTable = CellTable()
+    plant: PlantTable | None = None
     controller: ControllerTable = ControllerTable()
     estimator: EstimatorTable = EstimatorTable()
     limits: LimitsTable = LimitsTable()
@@ -222,6 +236,7 @@ class Config(_Table):
             if theta.voltage_sd and filter_
             else None,
             kalman=filter_,
+            plant_model=Electrochemical(**self.plant.model_dump()) if self.plant else None,
             soc_start_error=self.estimator.soc_start_error,
             sensors=sensors,
             hard=tuple(self.limits.hard),

@@ -81,6 +81,12 @@ class Episode:
             return self.true_start[:, index], self.true_end[:, index]
         return self.output_start[:, index], self.output_end[:, index]
 
+    def noise_free(self) -> Episode:
+        """The same episode with the true outputs as measured ones, where they are known."""
+        if self.true_start is None or self.true_end is None:
+            return self
+        return replace(self, output_start=self.true_start, output_end=self.true_end)
+
     @property
     def failures(self) -> int:
         """Control steps that were not solved to tolerance."""

@@ -116,7 +116,7 @@ def _assemble(
 
     measured = [r[1] for r in records]
     states = [m.state for m in (*([first] if first else []), *measured)]
-    simulated = bool(states) and all(s is not None for s in states) and all(m.true_start is not None for m in measured)
+    known = bool(measured) and all(m.true_start is not None for m in measured)
     return Episode(
         sampling_time_s=plant.sampling_time_s,
         input_names=tuple(s.name for s in plant.inputs),
@@ -134,9 +134,9 @@ def _assemble(
         iterations=np.array([r[4] for r in records], dtype=np.int64),
         ending=ending,
         message=message,
-        true_start=stack([m.true_start for m in measured], ny) if simulated else None,
-        true_end=stack([m.true_end for m in measured], ny) if simulated else None,
-        state=np.array(states, dtype=float) if simulated else None,
+        true_start=stack([m.true_start for m in measured], ny) if known else None,
+        true_end=stack([m.true_end for m in measured], ny) if known else None,
+        state=np.array(states, dtype=float) if states and all(s is not None for s in states) else None,
     )
 
 

@@ -1,0 +1,287 @@
+"""A cell from measured pulses: OCV, R0 and one or two R-C pairs over the state of charge, with uncertainties."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import least_squares, nnls
+
+from chargetune.battery.cell import VOLTAGE_ABOVE_FULL_V, Cell
+from chargetune.battery.cyclers import Record
+from chargetune.battery.ecm import ecm_model
+from chargetune.battery.pulses import PulseSet, find_pulse_sets, segments
+
+__all__ = ["Identification", "PulseFit", "cell_toml", "identify", "predicted_voltage"]
+
+# Time constants that pulses of some ten seconds can tell, s: the first pair, and both where there are two.
+TIME_CONSTANTS_S = {1: ((2.0, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
+# A standard deviation of more than this share says that the data do not hold the parameter.
+SPREAD_MAX = 1.0
+GRID = 12
+# A charge and a discharge farther apart are not slow, V.
+OCV_SPREAD_V = 0.1
+
+
+@dataclass(frozen=True)
+class PulseFit:
+    """One set of pulses: SOC in its middle, OCV before it (V), parameters and their standard deviations by name, rms (V).
+
+    The standard deviations come from the Jacobian at the solution, s^2 (J'J)^-1 with s^2 the mean squared residual: they
+    hold for independent noise, so they are too small where the circuit itself does not fit.
+    """
+
+    soc: float
+    ocv_V: float
+    values: dict[str, float]
+    sd: dict[str, float]
+    rms_V: float
+    time_s: NDArray[np.float64]
+    measured_V: NDArray[np.float64]
+    fitted_V: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The cell, the fits it is made of (falling SOC in the order of the file), remarks, and how long it took."""
+
+    cell: Cell
+    fits: tuple[PulseFit, ...]
+    remarks: tuple[str, ...]
+    seconds: float
+
+
+def identify(
+    record: Record, *, rc: Literal[1, 2] = 1, capacity_Ah: float | None = None, ocv: Record | None = None, name: str = ""
+) -> Identification:
+    """Fit a cell to a record of pulses at several SOC.
+
+    SOC is 1 where the record's charge is largest (a full charge) and counts the charge from there; without
+    ``capacity_Ah`` it is 0 where the charge is smallest, which takes a full discharge. The OCV is what the rests before
+    the pulses show, or with ``ocv`` the mean of one slow charge and discharge. Raises ValueError that says which
+    parameter the data do not hold.
+    """
+    began = time.perf_counter()
+    if rc not in (1, 2):
+        raise ValueError(f"rc = {rc!r}, allowed is 1 or 2")
+    sets = find_pulse_sets(record)
+    if len(sets) < 3:
+        raise ValueError(
+            f"{record.source}: {len(sets)} sets of pulses after a rest, needed are at least 3 at different SOC to identify R0, R1 and C1 over SOC"
+        )
+    charge = record.charge_Ah
+    span = float(np.max(charge[sets[0].first :]) - np.min(charge[sets[0].first :]))
+    capacity = span if capacity_Ah is None else capacity_Ah
+    if capacity < 0.999 * span:
+        raise ValueError(f"capacity_Ah = {capacity:g}, allowed is at least {span:.4g} Ah, the charge that the record passes")
+    soc = 1.0 + (charge - float(np.max(charge[sets[0].first :]))) / capacity
+    remarks = [*record.remarks]
+    if capacity_Ah is None:
+        remarks.append(f"capacity {capacity:.4g} Ah is the charge between the fullest and the emptiest point of the record")
+    grid, volts = _rests(record, sets, soc) if ocv is None else _slow(ocv, remarks)
+    curve = PchipInterpolator(grid, volts, extrapolate=True)
+    fits = [_fit(record, part, soc, curve, rc) for part in sets]
+    cell = _cell(record, fits, capacity, (grid, volts), rc, name or record.source)
+    return Identification(cell, tuple(fits), tuple(remarks), time.perf_counter() - began)
+
+
+def _rests(record: Record, sets: list[PulseSet], soc: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """OCV from the rests before the pulses, and from the last discharge towards empty."""
+    points = sorted({round(float(soc[s.first]), 6): float(record.voltage_V[s.first]) for s in sets}.items())
+    z, v = (np.array(column) for column in zip(*points, strict=True))
+    low = int(np.argmin(soc[sets[0].first :])) + sets[0].first
+    if soc[low] < z[0] - 0.02:
+        # At the end of a discharge the cell is polarised as much as at the last rest by the same current.
+        parts = [p for p in segments(record) if p[0] <= low < p[1]]
+        before = float(record.voltage_V[parts[0][0] - 1] - record.voltage_V[parts[0][0]])
+        z = np.concatenate([[soc[low]], z])
+        v = np.concatenate([[min(record.voltage_V[low] + max(before, 0.0), v[0] - 1e-3)], v])
+    return _covering(z, v)
+
+
+def _slow(ocv: Record, remarks: list[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """OCV between the longest charge and discharge at equal charge.
+
+    With V_c = OCV + R I_c and V_d = OCV - R I_d it is (V_c I_d + V_d I_c) / (I_c + I_d): their mean where the currents
+    are equal, and right also where the charge tapers at constant voltage.
+    """
+    longest: dict[int, tuple[int, int]] = {}
+    for first, last, sign in segments(ocv):
+        if sign and (sign not in longest or last - first > longest[sign][1] - longest[sign][0]):
+            longest[sign] = (first, last)
+    curves = []
+    for sign in (1, -1):
+        if sign not in longest:
+            raise ValueError(f"{ocv.source}: no {'charge' if sign > 0 else 'discharge'} with current, so it holds no OCV curve")
+        part = ocv.part(*longest[sign])
+        passed = part.charge_Ah
+        z = (passed - passed.min()) / (passed.max() - passed.min())
+        order = np.argsort(z, kind="stable")
+        curves.append((z[order], part.voltage_V[order], np.abs(part.current_A[order])))
+    grid = np.concatenate([np.linspace(0.0, 0.1, 11), np.linspace(0.15, 0.95, 17), [1.0]])
+    (v_c, i_c), (v_d, i_d) = ([np.interp(grid, z, values) for values in (v, i)] for z, v, i in curves)
+    between = (v_c * i_d + v_d * i_c) / (i_c + i_d)
+    remarks.append(f"OCV lies between the charge and the discharge in {ocv.source}")
+    apart = float(np.max(v_c - v_d))
+    if apart > OCV_SPREAD_V:
+        remarks.append(f"these are up to {1e3 * apart:.0f} mV apart, so this OCV is no better than a tenth of that")
+    return _covering(grid, np.maximum.accumulate(between))
+
+
+def _covering(z: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The table from SOC 0 to 1, strictly increasing; its ends go on with the slope beside them."""
+    keep = np.concatenate([[True], np.diff(z) > 1e-4])
+    z, v = np.clip(z[keep], 0.0, 1.0), v[keep]
+    if z[0] > 0:
+        z, v = np.concatenate([[0.0], z]), np.concatenate([[v[0] - z[0] * (v[1] - v[0]) / (z[1] - z[0])], v])
+    if z[-1] < 1:
+        z, v = np.concatenate([z, [1.0]]), np.concatenate([v, [v[-1] + (1 - z[-1]) * (v[-1] - v[-2]) / (z[-1] - z[-2])]])
+    for k, (low, high) in enumerate(pairwise(v.copy())):
+        v[k + 1] = max(high, v[k] + 1e-4) if high <= max(low, v[k]) else high
+    return z, v
+
+
+def _response(t: NDArray[np.float64], current: NDArray[np.float64], tau: float) -> NDArray[np.float64]:
+    """Voltage of an R-C pair with R = 1 ohm, from rest; each sample's current flowed since the sample before. Shape (n,)."""
+    out = np.zeros(t.size)
+    decay = np.exp(-np.diff(t) / tau)
+    for k in range(1, t.size):
+        out[k] = out[k - 1] * decay[k - 1] + (1 - decay[k - 1]) * current[k]
+    return out
+
+
+def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, rc: int) -> PulseFit:
+    pulses = part.of(record)
+    t, current, z = pulses.time_s - pulses.time_s[0], pulses.current_A, soc[part.first : part.last]
+    # What the OCV itself moves during the pulses is known; its level is measured just before them.
+    overpotential = pulses.voltage_V - pulses.voltage_V[0] - (curve(z) - curve(z[0]))
+    place = f"{record.source} at SOC {z[0]:.2f}"
+
+    def model(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        r0, *pairs = np.exp(x)
+        return np.asarray(
+            r0 * current + sum(r * _response(t, current, tau) for r, tau in zip(pairs[::2], pairs[1::2], strict=True)), dtype=np.float64
+        )
+
+    ranges = TIME_CONSTANTS_S[rc]
+    start = _start(t, current, overpotential, ranges)
+    lower = np.log([1e-7, *(b for low, _ in ranges for b in (1e-7, low))])
+    upper = np.log([1.0, *(b for _, high in ranges for b in (1.0, high))])
+    found = least_squares(
+        lambda x: model(x) - overpotential, np.clip(start, lower + 1e-6, upper - 1e-6), bounds=(lower, upper), x_scale=1.0
+    )
+    rms = float(np.sqrt(np.mean(found.fun**2)))
+    names = ["R0_ohm", *(name for k in range(1, rc + 1) for name in (f"R{k}_ohm", f"tau{k}_s"))]
+    try:
+        spread = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * np.mean(found.fun**2))
+    except np.linalg.LinAlgError:
+        spread = np.full(len(names), np.inf)
+    for label, relative in zip(names, spread, strict=True):
+        if not relative <= SPREAD_MAX:
+            raise ValueError(
+                f"{place}: the data do not hold {label} (standard deviation {100 * relative:.0f} % of it); "
+                f"longer pulses, faster sampling or {'--rc 1' if rc == 2 else 'larger currents'} would"
+            )
+    values = dict(zip(names, np.exp(found.x).tolist(), strict=True))
+    sd = {label: values[label] * float(s) for label, s in zip(names, spread, strict=True)}
+    for k in range(1, rc + 1):
+        r, tau = values[f"R{k}_ohm"], values[f"tau{k}_s"]
+        values[f"C{k}_F"] = tau / r
+        relative = np.hypot(sd[f"R{k}_ohm"] / r, sd[f"tau{k}_s"] / tau)
+        sd[f"C{k}_F"] = values[f"C{k}_F"] * float(relative)
+    middle = float(np.clip(np.mean(z), 0.0, 1.0))
+    fitted = pulses.voltage_V - overpotential + model(found.x)
+    return PulseFit(middle, float(pulses.voltage_V[0]), values, sd, rms, t, pulses.voltage_V, fitted)
+
+
+def _start(
+    t: NDArray[np.float64], current: NDArray[np.float64], overpotential: NDArray[np.float64], ranges: tuple[tuple[float, float], ...]
+) -> NDArray[np.float64]:
+    """Logarithms of R0, R1, tau1, ..: the best of a grid of time constants, resistances by non-negative least squares."""
+    grids = [np.geomspace(low * 1.05, high / 1.05, GRID) for low, high in ranges]
+    best, error = np.zeros(0), np.inf
+    responses = [[_response(t, current, tau) for tau in grid] for grid in grids]
+    for choice in np.ndindex(*(GRID,) * len(grids)):
+        columns = np.column_stack([current, *(responses[k][i] for k, i in enumerate(choice))])
+        resistances, residual = nnls(columns, overpotential)
+        if residual < error:
+            error = residual
+            pairs = [value for k, i in enumerate(choice) for value in (max(resistances[k + 1], 1e-6), grids[k][i])]
+            best = np.log([max(resistances[0], 1e-6), *pairs])
+    return best
+
+
+def _cell(
+    record: Record, fits: list[PulseFit], capacity: float, ocv: tuple[NDArray[np.float64], NDArray[np.float64]], rc: int, name: str
+) -> Cell:
+    ordered = sorted(fits, key=lambda fit: fit.soc)
+    table = {
+        key: tuple(float(fit.values[key]) for fit in ordered)
+        for key in ("R0_ohm", *(k for i in range(1, rc + 1) for k in (f"R{i}_ohm", f"C{i}_F")))
+    }
+    worst = 1e3 * max(fit.rms_V for fit in fits)
+    highest, lowest = float(np.max(record.voltage_V)), float(np.min(record.voltage_V))
+    made = f"Identified from the pulses in {record.source}: {len(fits)} SOC points, {rc}-RC, rms at most {worst:.2f} mV."
+    return Cell(
+        name=name,
+        capacity_Ah=round(capacity, 6),
+        coulombic_efficiency=1.0,
+        current_max_A=float(np.max(np.abs(record.current_A))),
+        voltage_min_V=round(min(lowest, float(ocv[1][0])), 3),
+        voltage_max_V=min(highest, np.floor(1e3 * (ocv[1][-1] + VOLTAGE_ABOVE_FULL_V)) / 1e3),
+        soc=tuple(fit.soc for fit in ordered),
+        ocv_soc=tuple(float(z) for z in ocv[0]),
+        ocv_V=tuple(float(v) for v in ocv[1]),
+        remark=made,
+        **table,  # type: ignore[arg-type]
+    )
+
+
+def cell_toml(cell: Cell) -> str:
+    """The cell as the file that `load_cell` reads."""
+
+    def row(values: tuple[float, ...]) -> str:
+        return "[" + ", ".join(f"{value:.7g}" for value in values) + "]"
+
+    def text(value: str) -> str:
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+    lines = [f"# {cell.remark}", f"name = {text(cell.name)}", f"remark = {text(cell.remark)}"]
+    lines += [
+        f"{key} = {getattr(cell, key):.7g}"
+        for key in ("capacity_Ah", "coulombic_efficiency", "current_max_A", "voltage_min_V", "voltage_max_V")
+    ]
+    lines += ["", "[ecm] # over SOC: ohm, farad", f"soc = {row(cell.soc)}"]
+    lines += [f"{key} = {row(getattr(cell, key))}" for key in cell.tables]
+    lines += ["", "[ocv] # open-circuit voltage, V", f"soc = {row(cell.ocv_soc)}", f"V = {row(cell.ocv_V)}"]
+    for name in ("thermal", "anode"):
+        part = getattr(cell, name)
+        if part is not None:
+            given = {key: value for key, value in part.__dict__.items() if value != ()}
+            lines += [
+                "",
+                f"[{name}]",
+                *(f"{key} = {row(value) if isinstance(value, tuple) else f'{value:.7g}'}" for key, value in given.items()),
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def predicted_voltage(
+    cell: Cell, record: Record, soc_start: float, *, step_s: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(time s, measured V, V of the cell's circuit) under the record's current, from rest at ``soc_start``, every ``step_s``."""
+    model = ecm_model(replace(cell, thermal=None), step_s)
+    at = np.arange(record.time_s[0], record.time_s[-1], step_s)
+    # The current of an interval is that of the first sample after its start.
+    after = np.minimum(np.searchsorted(record.time_s, at + 1e-9, side="left"), len(record) - 1)
+    current = record.current_A[after]
+    count = len(at)
+    whole = model.f.mapaccum("charge", count)(ca.DM([soc_start, *[0.0] * len(cell.pairs)]), current.reshape(1, -1), model.nominal)
+    voltage = np.array(model.h.map(count)(whole, current.reshape(1, -1), ca.repmat(ca.DM(model.nominal), 1, count)))[0]
+    return at + step_s, np.interp(at + step_s, record.time_s, record.voltage_V), voltage
