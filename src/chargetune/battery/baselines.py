@@ -88,7 +88,7 @@ Law = Callable[[float], float]
 
 def constant_current(current_A: float) -> Law:
     """The CC of CC-CV."""
-    return lambda soc: current_A
+    return lambda _: current_A
 
 
 def multi_step(currents_A: Sequence[float]) -> Law:

@@ -54,7 +54,7 @@ class ChargingProblem:
     Objective of the paper: G = -sum_{k=0..K} c1 (z_d - z_k)^2 - sum_{k<K} max(0, V_k - v_max)^2, V_k the larger of the
     voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; each limit
     is scored on its own, upper voltage, temperature and anode potential also in ``soc_windows`` equal parts of the SOC,
-    and as moving mean over ``verdict_samples`` intervals where measurements have noise.
+    and as moving mean over ``verdict_samples`` intervals where the signal's sensor has noise.
     Limits that the controller's model predicts are kept by it softly; ``hard`` and ``scored_only`` name the exceptions.
     """
 
@@ -291,7 +291,8 @@ class ChargingProblem:
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
             raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        excess = {limit.name: limit.excess(episode, self.verdict_samples) for limit in self.limits}
+        noisy = {limit.name: self.sensors.noise_sd.get(limit.signal, 0.0) > 0 for limit in self.limits}
+        excess = {limit.name: limit.excess(episode, self.verdict_samples if noisy[limit.name] else 1) for limit in self.limits}
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
         for limit in self.limits[2:]:

@@ -171,7 +171,7 @@ def _strung(name: str, time: NDArray[np.float64], remarks: list[str]) -> NDArray
     """Time that increases: a step whose clock restarts begins where the one before ended."""
     steps = np.diff(time)
     falls = np.flatnonzero(steps < 0)
-    for k in falls:
+    for k in falls.tolist():
         # A clock that restarts begins near zero; another one that falls is damage.
         if time[k + 1] > 0.1 * time[k] and time[k + 1] > 60.0:
             raise ValueError(f"{name}, sample {k + 2}: time = {time[k + 1]:g} s after {time[k]:g} s, allowed is an increasing time")

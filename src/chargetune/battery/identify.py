@@ -73,7 +73,7 @@ def identify(
     sets = find_pulse_sets(record)
     if len(sets) < 3:
         raise ValueError(
-            f"{record.source}: {len(sets)} sets of pulses after a rest, needed are at least 3 at different SOC to identify R0, R1 and C1 over SOC"
+            f"{record.source}: {len(sets)} sets of pulses after a rest; to identify R0, R1 and C1 over SOC at least 3 are needed"
         )
     charge = record.charge_Ah
     span = float(np.max(charge[sets[0].first :]) - np.min(charge[sets[0].first :]))

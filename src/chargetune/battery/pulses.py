@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,9 @@ class PulseSet:
 
 def segments(record: Record) -> list[tuple[int, int, int]]:
     """(first, last not included, sign of the current) of each stretch of rest (0), charge (1) and discharge (-1)."""
-    sign: NDArray[np.int64] = (np.sign(record.current_A) * (np.abs(record.current_A) > record.rest_A)).astype(int)
+    sign: NDArray[np.int64] = (np.sign(record.current_A) * (np.abs(record.current_A) > record.rest_A)).astype(np.int64)
     edges = [0, *(np.flatnonzero(np.diff(sign)) + 1).tolist(), len(sign)]
-    return [(a, b, int(sign[a])) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(a, b, int(sign[a])) for a, b in pairwise(edges)]
 
 
 def find_pulse_sets(record: Record) -> list[PulseSet]:

@@ -107,6 +107,42 @@ def reproduce(
     reproduce_command(case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, as_json=as_json)
 
 
+@app.command()
+def identify(
+    data: Annotated[Path, typer.Argument(help="Measured pulses (CSV of a cycler).", show_default=False)],
+    out: Annotated[Path, typer.Option("--output", "-o", help="Cell file to write.")] = Path("cell.toml"),
+    rc: Annotated[int, typer.Option(min=1, max=2, help="R-C pairs of the circuit.")] = 1,
+    capacity: Annotated[
+        float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
+    ] = None,
+    ocv: Annotated[Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
+    check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fit a cell's circuit to measured pulses: OCV, R0 and R-C pairs over SOC."""
+    from chargetune.cli.identify import identify_command
+
+    identify_command(data, out=out, rc=rc, capacity_Ah=capacity, ocv=ocv, name=name, figure=figure, check=check or [], as_json=as_json)
+
+
+@app.command()
+def compare(
+    config: ConfigFile,
+    store: Annotated[Path | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
+    study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise that the controllers see.")] = 0,
+    workers: Workers = 2,
+    figure: Annotated[Path | None, typer.Option(help="Figure to write (png, pdf, svg).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle."""
+    from chargetune.cli.compare import compare_command
+
+    compare_command(config, store=store, study=study, seed=seed, workers=workers, figure=figure, as_json=as_json)
+
+
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
     if value:
         typer.echo(f"chargetune {__version__}")

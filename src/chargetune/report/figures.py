@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chargetune.report.convergence import convergence_figure
-from chargetune.report.learned import backoff_figure, resistance_figure
+from chargetune.report.learned import backoff_figure, current_limit_figure, resistance_figure
 from chargetune.report.reading import StudyView, read_study
 from chargetune.report.style import FORMATS, save
 from chargetune.report.trajectories import trajectories_figure
@@ -27,6 +27,8 @@ def figures_of(view: StudyView) -> dict[str, Figure]:
             figures["trajectories"] = trajectories_figure(view)
         if view.problem.backoff is not None:
             figures["backoff"] = backoff_figure(view)
+        if view.problem.current_limit is not None:
+            figures["current_limit"] = current_limit_figure(view)
         for ratio in view.problem.ratios:
             figures[ratio.of] = resistance_figure(view, ratio.of)
     figures["convergence"] = convergence_figure(view)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["backoff_figure", "backoff_values", "resistance_figure", "resistance_values", "violated_soc"]
+__all__ = ["backoff_figure", "backoff_values", "current_limit_figure", "resistance_figure", "resistance_values", "violated_soc"]
 
 SOC = np.linspace(0.0, 1.0, 201)
 
@@ -97,6 +97,28 @@ def resistance_figure(view: StudyView, of: str) -> Figure:
                 axis.plot(100 * np.array(problem.plant_cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
         axis.set_ylim(bottom=0.0)
         axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")
+        _finish(figure, axis, view, problem.plant_cell, handles)
+    return figure
+
+
+def current_limit_figure(view: StudyView) -> Figure:
+    """The current limit over SOC in A of all trials. Raises ValueError when theta has none."""
+    problem = view.problem
+    if problem is None or problem.current_limit is None:
+        raise ValueError(f"study {view.name!r} does not tune a current limit")
+    part, grid, largest = view.space.slices["current_limit"], problem.current_limit.grid, problem.current_max_A or 0.0
+
+    def values(theta: Any) -> NDArray[np.float64]:
+        return np.asarray(largest * np.interp(SOC, grid, np.array(theta[part])), dtype=np.float64)
+
+    with journal_style():
+        figure, (axis,) = new_figure(COLUMN_IN, 2.7)
+        handles = _grey(axis, [values(t.theta) for t in view.others])
+        for label, theta in _thetas(view).items():
+            color, text, dashes = (ORANGE, view.tuned_label, view.tuned_dashes) if label == "tuned" else (BLUE, label, "-")
+            handles += axis.plot(100 * SOC, values(theta), color=color, linestyle=dashes, label=text, zorder=3)
+        axis.set_ylim(0.0, 1.05 * largest)
+        axis.set_ylabel("current limit (A)")
         _finish(figure, axis, view, problem.plant_cell, handles)
     return figure
 

@@ -1,0 +1,56 @@
+"""From a cell on the bench to the cell file of a controller: here the bench is PyBaMM's DFN.
+
+Run: python examples/electrochemical_cell.py OUT.toml. A pulse test at 298 K gives the circuit, pulse tests at two more
+temperatures how its resistance falls when it warms, and one charge its heat capacity and cooling.
+`examples/okane2022.toml` was made by this script.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from chargetune.battery.baselines import charge, constant_current
+from chargetune.battery.cyclers import Record
+from chargetune.battery.electrochemical import Electrochemical
+from chargetune.battery.identify import cell_toml, identify
+from chargetune.battery.identify_thermal import activation_energy, with_thermal
+from chargetune.battery.limits import Limit
+from chargetune.battery.pulse_test import pulse_test
+from chargetune.plants.sensors import Sensors
+
+
+def bench(ambient_K, seconds, soc=1.0):
+    """The cell at rest in a chamber of this temperature, sampled every ``seconds``."""
+    return Electrochemical(ambient_K=ambient_K).plant(soc, seconds, Sensors())
+
+
+capacity = Electrochemical().capacity_Ah
+cells = {}
+for ambient in (283.15, 298.15, 313.15):
+    record = pulse_test(lambda seconds, ambient=ambient: bench(ambient, seconds), capacity_Ah=capacity, voltage_min_V=2.5)
+    cells[ambient] = identify(record, capacity_Ah=capacity).cell
+    print(f"{ambient:.0f} K: {cells[ambient].remark}")
+
+limit = Limit("voltage_max_V", 4.2, 0.0)
+run = charge(bench(298.15, 10.0, 0.05), constant_current(5.0), [limit], steps=420, soc_target=1.0, current_max_A=5.0)
+warm = Record(
+    "simulated 1C charge",
+    np.append(0.0, run.time_s + 10.0),
+    np.append(0.0, run.input[:, 0]),
+    np.append(run.signal("voltage_V")[0][0], run.signal("voltage_V")[1]),
+    np.append(298.15, run.signal("temperature_K")[1]),
+)
+energy = activation_energy(cells)
+cell = with_thermal(cells[298.15], warm, 0.05, activation_J_mol=energy)
+cell = replace(
+    cell,
+    name="OKane2022 (DFN), LG M50 5 Ah",
+    current_max_A=15.0,
+    voltage_min_V=2.5,
+    voltage_max_V=4.2,
+    remark="R-RC circuit identified from simulated pulses on PyBaMM's DFN with the parameters of O'Kane et al., PCCP 24 (2022) 7909.",
+)
+print(f"E = {energy:.0f} J/mol, C = {cell.thermal.heat_capacity_J_K:.1f} J/K, hA = {cell.thermal.cooling_W_K:.4f} W/K")
+Path(sys.argv[1] if len(sys.argv) > 1 else "okane2022.toml").write_text(cell_toml(cell), encoding="utf-8")

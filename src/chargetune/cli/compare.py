@@ -1,0 +1,107 @@
+"""chargetune compare."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.compare import Row, compare, row_names
+from chargetune.battery.config import load_config
+from chargetune.cli.output import console, number
+from chargetune.cli.tune import bar
+from chargetune.study.executors import process_executor
+
+__all__ = ["compare_command"]
+
+
+def compare_command(
+    path: Path, *, store: Path | None, study: str | None, seed: int, workers: int, figure: Path | None, as_json: bool
+) -> None:
+    """Charge the plant of a study file in every way there is, and print one table."""
+    config = load_config(path)
+    problem = config.problem(path.parent)
+    theta = None if store is None else _tuned(store, study or config.study.name, problem)
+    names = row_names(problem, theta)
+    found: dict[str, Row] = {}
+    with ExitStack() as stack:
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
+        progress = stack.enter_context(bar(quiet=as_json))
+        task = progress.add_task("charging", total=len(names), note="")
+        for row in compare(problem, theta, seed=seed, executor=executor):
+            found[row.name] = row
+            progress.update(task, advance=1, note=row.name)
+    rows = [found[name] for name in names]
+    if figure is not None:
+        from chargetune.report.comparison import comparison_figure
+        from chargetune.report.style import save
+
+        save(comparison_figure(problem, rows), figure)
+    if as_json:
+        print(json.dumps({"rows": [_facts(row) for row in rows]}))  # noqa: T201
+        return
+    screen = console()
+    screen.print(_table(rows))
+    screen.print(
+        "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), least anode potential, "
+        "highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
+        "and is what can be reached.[/]"
+    )
+    if store is None:
+        screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
+    if figure is not None:
+        screen.print(f"figure {figure}")
+
+
+def _tuned(store: Path, study: str, problem: ChargingProblem) -> list[float]:
+    from chargetune.report.reading import read_study
+
+    view = read_study(store, study)
+    if view.tuned is None:
+        raise ValueError(f"{store}: study {study!r} has no trial with a score yet")
+    return [float(value) for value in problem.space.validate(view.tuned.theta)]
+
+
+def _facts(row: Row) -> dict[str, Any]:
+    metrics = row.score.metrics if row.score else {}
+    return {
+        "name": row.name,
+        "t80_min": metrics.get("t80_min"),
+        "t90_min": metrics.get("t90_min"),
+        "worst_excess": row.worst_excess,
+        "breaks_limit": row.breaks_limit,
+        "anode_potential_min_mV": _extreme(row, "anode_potential_V", largest=False, factor=1e3),
+        "temperature_max_K": _extreme(row, "temperature_K", largest=True, factor=1.0),
+        "ending": row.episode.ending.value,
+        "message": row.episode.message,
+    }
+
+
+def _extreme(row: Row, signal: str, *, largest: bool, factor: float) -> float | None:
+    if signal not in row.episode.output_names or not len(row.episode):
+        return None
+    start, end = row.episode.signal(signal)
+    return factor * float(max(start.max(), end.max()) if largest else min(start.min(), end.min()))
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "t80 min", "t90 min", "overshoot mV", "anode mV", "max K", "limits"):
+        table.add_column(heading, justify="left" if heading in ("", "limits") else "right", no_wrap=True)
+    for row in rows:
+        facts = _facts(row)
+        excess = facts["worst_excess"]
+        table.add_row(
+            row.name,
+            number(facts["t80_min"]),
+            number(facts["t90_min"]),
+            number(excess["voltage_mV"], 1),
+            number(facts["anode_potential_min_mV"], 1),
+            number(facts["temperature_max_K"], 1),
+            "[red]broken[/]" if row.breaks_limit else "kept",
+        )
+    return table
