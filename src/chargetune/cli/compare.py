@@ -14,6 +14,7 @@ from chargetune.battery.compare import Row, compare, row_names
 from chargetune.battery.config import load_config
 from chargetune.cli.output import console, number
 from chargetune.cli.tune import bar
+from chargetune.report.style import check_format
 from chargetune.study.executors import process_executor
 
 __all__ = ["compare_command"]
@@ -23,6 +24,8 @@ def compare_command(
     path: Path, *, store: Path | None, study: str | None, seed: int, workers: int, figure: Path | None, as_json: bool
 ) -> None:
     """Charge the plant of a study file in every way there is, and print one table."""
+    if figure is not None:
+        check_format(figure)
     config = load_config(path)
     problem = config.problem(path.parent)
     theta = None if store is None else _tuned(store, study or config.study.name, problem)

@@ -15,6 +15,7 @@ from chargetune.battery.cyclers import Record, read_record
 from chargetune.battery.identify import Identification, cell_toml, identify, predicted_voltage
 from chargetune.battery.pulses import segments
 from chargetune.cli.output import console
+from chargetune.report.style import check_format
 
 __all__ = ["identify_command"]
 
@@ -32,6 +33,8 @@ def identify_command(
     as_json: bool,
 ) -> None:
     """Fit a cell to measured pulses, write it, and say how well it fits."""
+    if figure is not None:
+        check_format(figure)
     slow = None if ocv is None else read_record(ocv)
     found = identify(read_record(data), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
     out.parent.mkdir(parents=True, exist_ok=True)

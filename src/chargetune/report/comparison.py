@@ -51,10 +51,6 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
             style: dict[str, Any] = {"color": COLOURS[row.name], "linewidth": 1.3} if own else {"color": GREY, "linewidth": 0.8}
             if not own:
                 style["linestyle"] = next(dashes, "-")
-                "color": COLOURS.get(row.name, GREY),
-                "linewidth": 1.3 if own else 0.8,
-                "linestyle": "-" if own else next(dashes, "-"),
-            }
             label = f"{row.name}{' (breaks a limit)' if row.breaks_limit else ''}"
             for name, axis in zip(names, axes, strict=False):
                 signal = "voltage_V" if name == "near" else name

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BLUE", "COLUMN_IN", "FORMATS", "GREEN", "GREY", "ORANGE", "PAGE_IN", "RED",
-    "cell_note", "journal_style", "legend_above", "letter", "new_figure", "plain_symlog", "save", "words",
+    "cell_note", "check_format", "journal_style", "legend_above", "letter", "new_figure", "plain_symlog", "save", "words",
 ]  # fmt: skip
 
 # Okabe and Ito's palette, told apart with every kind of colour vision; the red is darker, to differ from the orange in lightness too.
@@ -115,12 +115,17 @@ def cell_note(figure: Figure, name: str, remark: str) -> None:
         note.set_parse_math(False)
 
 
+def check_format(path: str | os.PathLike[str]) -> str:
+    """The format that the path's ending names. Raises ValueError, so that nobody waits for a figure that cannot be written."""
+    kind = Path(path).suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise ValueError(f"figure {path}: format {kind!r}, allowed are {', '.join(FORMATS)}")
+    return kind
+
+
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure in the format of the path's ending; the same figure gives the same bytes. Raises ValueError."""
-    target = Path(path)
-    kind = target.suffix.removeprefix(".").lower()
-    if kind not in FORMATS:
-        raise ValueError(f"figure {target}: format {kind!r}, allowed are {', '.join(FORMATS)}")
+    target, kind = Path(path), check_format(path)
     with journal_style():
         # The layout depends on the resolution and on the layout before, so it is settled once, at the same one for every format.
         figure.set_dpi(DPI)
