@@ -25,6 +25,8 @@ TIME_CONSTANTS_S = {1: ((2.0, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
 # A standard deviation of more than this share says that the data do not hold the parameter.
 SPREAD_MAX = 1.0
 GRID = 12
+# More than any sensor's noise, mV.
+OFFSET_MAX_MV = 20.0
 # A charge and a discharge farther apart are not slow, V.
 OCV_SPREAD_V = 0.1
 
@@ -163,33 +165,32 @@ def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, r
     overpotential = pulses.voltage_V - pulses.voltage_V[0] - (curve(z) - curve(z[0]))
     place = f"{record.source} at SOC {z[0]:.2f}"
 
+    # The level before the pulses is one sample with its noise, hence an offset (in mV, so that all unknowns are of one size).
     def model(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        r0, *pairs = np.exp(x)
-        return np.asarray(
-            r0 * current + sum(r * _response(t, current, tau) for r, tau in zip(pairs[::2], pairs[1::2], strict=True)), dtype=np.float64
-        )
+        r0, *pairs = np.exp(x[:-1])
+        slow = sum(r * _response(t, current, tau) for r, tau in zip(pairs[::2], pairs[1::2], strict=True))
+        return np.asarray(1e-3 * x[-1] + r0 * current + slow, dtype=np.float64)
 
     ranges = TIME_CONSTANTS_S[rc]
     start = _start(t, current, overpotential, ranges)
-    lower = np.log([1e-7, *(b for low, _ in ranges for b in (1e-7, low))])
-    upper = np.log([1.0, *(b for _, high in ranges for b in (1.0, high))])
+    lower = np.append(np.log([1e-7, *(b for low, _ in ranges for b in (1e-7, low))]), -OFFSET_MAX_MV)
+    upper = np.append(np.log([1.0, *(b for _, high in ranges for b in (1.0, high))]), OFFSET_MAX_MV)
     found = least_squares(
-        lambda x: model(x) - overpotential, np.clip(start, lower + 1e-6, upper - 1e-6), bounds=(lower, upper), x_scale=1.0
+        lambda x: model(x) - overpotential, np.clip(np.append(start, 0.0), lower + 1e-6, upper - 1e-6), bounds=(lower, upper), x_scale=1.0
     )
     rms = float(np.sqrt(np.mean(found.fun**2)))
     names = ["R0_ohm", *(name for k in range(1, rc + 1) for name in (f"R{k}_ohm", f"tau{k}_s"))]
-    try:
-        spread = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * np.mean(found.fun**2))
-    except np.linalg.LinAlgError:
-        spread = np.full(len(names), np.inf)
-    for label, relative in zip(names, spread, strict=True):
+    _, sizes, directions = np.linalg.svd(found.jac, full_matrices=False)
+    spread = np.sqrt(np.sum((directions / np.maximum(sizes, 1e-12)[:, None]) ** 2, axis=0) * np.mean(found.fun**2))
+    # Logarithms are fitted, so these are relative; the last one is the offset's.
+    for label, relative in zip(names, spread[:-1], strict=True):
         if not relative <= SPREAD_MAX:
             raise ValueError(
                 f"{place}: the data do not hold {label} (standard deviation {100 * relative:.0f} % of it); "
                 f"longer pulses, faster sampling or {'--rc 1' if rc == 2 else 'larger currents'} would"
             )
-    values = dict(zip(names, np.exp(found.x).tolist(), strict=True))
-    sd = {label: values[label] * float(s) for label, s in zip(names, spread, strict=True)}
+    values = dict(zip(names, np.exp(found.x[:-1]).tolist(), strict=True))
+    sd = {label: values[label] * float(s) for label, s in zip(names, spread[:-1], strict=True)}
     for k in range(1, rc + 1):
         r, tau = values[f"R{k}_ohm"], values[f"tau{k}_s"]
         values[f"C{k}_F"] = tau / r
@@ -197,7 +198,7 @@ def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, r
         sd[f"C{k}_F"] = values[f"C{k}_F"] * float(relative)
     middle = float(np.clip(np.mean(z), 0.0, 1.0))
     fitted = pulses.voltage_V - overpotential + model(found.x)
-    return PulseFit(middle, float(pulses.voltage_V[0]), values, sd, rms, t, pulses.voltage_V, fitted)
+    return PulseFit(middle, float(pulses.voltage_V[0] + 1e-3 * found.x[-1]), values, sd, rms, t, pulses.voltage_V, fitted)
 
 
 def _start(
