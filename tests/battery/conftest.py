@@ -1,10 +1,16 @@
 """What the tests of this folder share: the default cell, and a short charge with round numbers."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from chargetune.battery.cell import default_cell
 from chargetune.episode.episode import Ending, Episode
+
+# The BPX cell of these tests is importable by name.
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,13 @@
 """The electrochemical plant against PyBaMM's own simulation, charge counting and itself."""
 
+import json
 import pickle
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from bpx_cell import CELL
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem
@@ -186,3 +188,21 @@ def test_the_model_is_built_once():
     begin = time.perf_counter()
     SPM.plant(0.3, 10.0, Sensors()).reset(1)
     assert time.perf_counter() - begin < 0.2
+
+
+# PyBaMM says which of its fields a BPX file does not have.
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_bpx_file(tmp_path):
+    path = tmp_path / "cell.json"
+    path.write_text(json.dumps(CELL))
+    settings = Electrochemical(parameters=str(path))
+    found = charged(settings, [5.0] * 3, soc=0.5)
+    rest = charged(settings, [0.0], soc=0.5)[0].end
+    # The negative electrode holds 0.15 m2 x 60 um x 2/3 x 30000 mol/m3 x F = 4.83 Ah, of which 79 % and more are used.
+    assert 0.79 * 4.83 < settings.capacity_Ah < 4.83
+    assert 3.5 < rest[0] < found[0].end[0] < found[2].end[0] < 4.2
+    assert rest[3] > found[2].end[3]
+    assert found[2].end[2] > 298.15
+    path.write_text(json.dumps({**CELL, "Header": {}}))
+    with pytest.raises(ValueError, match=r"cell\.json is no BPX file"):
+        _ = Electrochemical(parameters=str(path), model="SPM").capacity_Ah

@@ -22,7 +22,8 @@ def differences(function, at, step=1e-6):
 
 def coordinates(problem, inputs, rows, derivatives, lower, upper):
     """(g, T, rows of A, lba, uba, span, gamma) of the QP with v = T e and the slacks apart."""
-    g, columns, lba, uba, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+    flat = np.zeros(problem.size)
+    g, columns, lba, uba, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, flat))
     slacks, size = len(problem.controller.limits), problem.size
     return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma[0, 0])
 
@@ -49,7 +50,7 @@ def test_slacks_stand_against_their_rows_with_the_penalty_as_price():
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    g, columns, *_, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper))
+    g, columns, *_, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size)))
     for j, limit in enumerate(own.limits):
         price = float(gamma[0, 0]) * limit.penalty * limit.scale
         # s = e / sqrt(price) costs price (s + s^2 / 2).
@@ -81,6 +82,39 @@ def test_transformed_hessian_is_gauss_newton_by_dense_algebra():
     np.testing.assert_allclose(transform.T @ scaled @ transform, np.eye(problem.size), atol=1e-5)
 
 
+def test_curvature_is_that_of_the_lagrangian_in_each_input():
+    """load = 0.8 force + speed^2 at the end of each interval: bent in the force of its own interval by the speed it brings."""
+    own = controller("Y", limits=[SoftLimit("load", upper=0.6, at="end")])
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    gamma = float(problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size))[-1])
+    multipliers = np.random.default_rng(0).uniform(0.0, 2.0, len(problem.groups))
+
+    def lagrangian(at):
+        cost, c, _ = problem.sweep(now, at, q)
+        return gamma * float(cost) + multipliers @ np.array(c).ravel()
+
+    step, found = 1e-3, np.array(problem.curvature(now, inputs, derivatives, multipliers, lower, upper, q)).ravel()
+    last = np.zeros(problem.size)
+    last[-1] = step
+    # At the last stage the Lagrangian's curvature is the stage's own and that of the costs, 0.2 for the force and 10 at the end.
+    total = (lagrangian(inputs + last) - 2 * lagrangian(inputs) + lagrangian(inputs - last)) / step**2
+    ahead = differences(lambda u: np.array([own_position(own, now, u)]), inputs)[0, -1]
+    assert found[-1] == pytest.approx(total - gamma * (0.2 + 10 * ahead**2), rel=1e-4, abs=1e-6)
+    assert found[-1] > 0
+    assert np.all(found >= 0)
+    flat, bent = (np.array(problem.quadratic(inputs, rows, derivatives, lower, upper, w)[0]).ravel() for w in (0 * found, found))
+    assert np.max(np.abs(flat - bent)) > 1e-6
+
+
+def own_position(own, now, inputs):
+    x = now
+    for value in inputs:
+        x = np.array(own.model.f(x, value, own.model.nominal)).ravel()
+    return x[0]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_residual_is_zero_where_ipopt_says_it_is_optimal_and_nowhere_near(seed):
     own = controller("E")
@@ -90,7 +124,7 @@ def test_residual_is_zero_where_ipopt_says_it_is_optimal_and_nowhere_near(seed):
 
     def residual(at, duals):
         _, rows, derivatives = problem.sweep(now, at, q)
-        gamma = problem.quadratic(at, rows, derivatives, lower, upper)[-1]
+        gamma = problem.quadratic(at, rows, derivatives, lower, upper, np.zeros(problem.size))[-1]
         return float(problem.residual(at, rows, derivatives, float(gamma) * 0.1 * duals, gamma, lower, upper))
 
     assert residual(best, multipliers) < 1e-5
@@ -107,7 +141,7 @@ def test_residual_sees_a_multiplier_of_an_unused_row():
     now, _, q, lower, upper = random_point(problem)
     inputs, *_ = solver(problem)(now, cold(problem, np.zeros(1)), q)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    gamma = problem.quadratic(inputs, rows, derivatives, lower, upper)[-1]
+    gamma = problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size))[-1]
     none, both = np.zeros(2 * own.horizon), np.zeros(2 * own.horizon)
     both[:2] = 0.3
     assert float(problem.residual(inputs, rows, derivatives, none, gamma, lower, upper)) <= KKT_TOLERANCE

@@ -270,7 +270,11 @@ def _parameters(settings: Electrochemical) -> Any:
     if _is_file(settings.parameters):
         if not Path(settings.parameters).is_file():
             raise FileNotFoundError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
-        return pybamm.ParameterValues.create_from_bpx(settings.parameters)
+        try:
+            return pybamm.ParameterValues.create_from_bpx(settings.parameters)
+        except Exception as error:
+            # Its parser raises what pydantic, json and pybamm raise.
+            raise ValueError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
     known = sorted(pybamm.parameter_sets.keys())
     if settings.parameters not in known:
         raise ValueError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")

@@ -89,7 +89,9 @@ class Limit:
 
 def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64]:
     """Centred mean of ``samples`` neighbours, fewer at the ends, shape unchanged."""
-    if samples == 1 or not values.size:
+    if samples == 1:
         return values
-    window = np.ones(min(samples, values.size))
-    return np.asarray(np.convolve(values, window, "same") / np.convolve(np.ones(values.size), window, "same"), dtype=np.float64)
+    total, at = np.concatenate([[0.0], np.cumsum(values)]), np.arange(values.size)
+    first = np.maximum(at - samples // 2, 0)
+    beyond = np.minimum(at + (samples - 1) // 2 + 1, values.size)
+    return np.asarray((total[beyond] - total[first]) / (beyond - first), dtype=np.float64)

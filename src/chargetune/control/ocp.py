@@ -34,8 +34,12 @@ class Problem:
     sweep
         (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
     quadratic
-        (U, c, D, lower, upper) -> (g, A', lba, uba, span, gamma): the QP of `control.qp`, one slack a limit. Its first N nu
-        rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J.
+        (U, c, D, lower, upper, W) -> (g, A', lba, uba, span, gamma): the QP of `control.qp`, one slack a limit. Its first
+        N nu rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J, and W, shape (N nu,),
+        is added to the diagonal of the stages' input Hessians.
+    curvature
+        (now, U, D, multipliers, lower, upper, q) -> W: what constraints and dynamics add to that diagonal in the
+        Lagrangian, where it is positive.
     residual
         (U, c, D, multipliers, gamma, lower, upper) -> largest natural residual of the scaled optimality conditions.
     merit
@@ -53,6 +57,7 @@ class Problem:
     bounds: ca.Function
     sweep: ca.Function
     quadratic: ca.Function
+    curvature: ca.Function
     residual: ca.Function
     merit: ca.Function
     fallback: ca.Function
@@ -126,6 +131,7 @@ def control_problem(controller: Controller) -> Problem:
     final = _Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
     groups = (*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal"))
     packed_stage = ca.Function("stage", [x, u, now, q, weight], _cse(after, stage_cost, stage_rows, stage.packed))
+    follow = ca.Function("follow", [x, u, q], _cse(after))
     packed_final = ca.Function("final", [x, now, q], _cse(final_cost, final_rows, final.packed))
     return Problem(
         controller=controller,
@@ -133,6 +139,7 @@ def control_problem(controller: Controller) -> Problem:
         bounds=ca.Function("bounds", [now, q], [ca.repmat(lower, horizon, 1), ca.repmat(upper, horizon, 1)]),
         sweep=_sweep(packed_stage, packed_final, horizon, nx, nu, q.shape[0]),
         quadratic=_quadratic(controller, stage, final, groups),
+        curvature=_curvature(follow, _second(x, u, now, q, weight, after, stage_rows), stage, final, horizon),
         residual=_residual(controller, stage, final, groups),
         merit=_merit(controller, groups),
         fallback=ca.Function("fallback", [now, q], [fallback]),
@@ -225,6 +232,48 @@ def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, hori
     return [stage.unpack(vector[i * n : (i + 1) * n]) for i in range(horizon)], final.unpack(vector[horizon * n :])
 
 
+def _second(x: Any, u: Any, now: Any, q: Any, weight: Any, after: Any, rows: Any) -> ca.Function:
+    """(x, u, now, q, weight, costate, multipliers) -> positive part of the diagonal of d2/du2 (costate' f + multipliers' c)."""
+    costate, multipliers = ca.SX.sym("costate", after.shape[0]), ca.SX.sym("lambda", rows.shape[0])
+    total = ca.dot(costate, after) + ca.dot(multipliers, rows)
+    bent = ca.diag(ca.densify(ca.hessian(total, u)[0]))
+    return ca.Function("second", [x, u, now, q, weight, costate, multipliers], _cse(ca.fmax(bent, 0)))
+
+
+def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, final: _Linearisation, horizon: int) -> ca.Function:
+    nx, nu, nq, width = follow.size1_in(0), follow.size1_in(1), follow.size1_in(2), second.size1_in(6)
+    own, last = ca.SX.sym("D", stage.length), ca.SX.sym("D", final.length)
+    ahead, mu, gamma = ca.SX.sym("costate", nx), ca.SX.sym("lambda", width), ca.SX.sym("gamma")
+    f_x, _, c_x, _, l_x, *_ = stage.unpack(own)
+    *_, final_x, _, final_slope, _, _, _, _ = final.unpack(last)
+    mu_last = ca.SX.sym("lambda", final_x.shape[0])
+    back = ca.Function("back", [own, ahead, mu, gamma], _cse(gamma * l_x + ca.mtimes(c_x.T, mu) + ca.mtimes(f_x.T, ahead)))
+    end = ca.Function("end", [last, mu_last, gamma], _cse(gamma * final_slope + ca.mtimes(final_x.T, mu_last)))
+
+    low, high, whole = (
+        ca.SX.sym("lower", horizon * nu),
+        ca.SX.sym("upper", horizon * nu),
+        ca.SX.sym("D", horizon * stage.length + final.length),
+    )
+    ranges = [ca.diag(block) for block in _blocks(_span(low, high), nu)]
+    scaled = ca.Function("scaling", [whole, low, high], _cse(_scaling(*_derivatives(whole, stage, final, horizon), ranges)))
+
+    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", nq)
+    vector, multipliers = ca.MX.sym("D", whole.shape[0]), ca.MX.sym("lambda", horizon * width + final_x.shape[0])
+    lower, upper = ca.MX.sym("lower", horizon * nu), ca.MX.sym("upper", horizon * nu)
+    scaling = scaled(vector, lower, upper)
+    states = [now]
+    for i in range(horizon - 1):
+        states.append(follow(states[-1], inputs[i * nu : (i + 1) * nu], q))
+    costate = end(vector[horizon * stage.length :], multipliers[horizon * width :], scaling)
+    out: list[Any] = []
+    for i in reversed(range(horizon)):
+        u, lam = inputs[i * nu : (i + 1) * nu], multipliers[i * width : (i + 1) * width]
+        out.insert(0, second(states[i], u, now, q, row_weight(i, horizon), costate, lam))
+        costate = back(vector[i * stage.length : (i + 1) * stage.length], costate, lam, scaling)
+    return ca.Function("curvature", [now, inputs, vector, multipliers, lower, upper, q], [ca.vertcat(*out)])
+
+
 def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
     """The QP by a Riccati recursion, in coordinates that make its Hessian the identity.
 
@@ -241,24 +290,17 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
     inputs, lower, upper = (ca.SX.sym(n, size) for n in ("U", "lower", "upper"))
     rows, vector = ca.SX.sym("c", len(groups)), ca.SX.sym("D", horizon * stage.length + final.length)
     stages, last = _derivatives(vector, stage, final, horizon)
-    span = _span(lower, upper)
-    ranges = [ca.diag(block) for block in _blocks(span, nu)]
-
-    # gamma makes the mean of the Hessian's diagonal one.
-    weight, total = last[6], ca.SX(0)
-    for scale, (f_x, f_u, _, _, _, _, l_xx, _, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
-        total += ca.trace(ca.densify(ca.mtimes([scale, l_uu + ca.mtimes([f_u.T, weight, f_u]), scale])))
-        weight = l_xx + ca.mtimes([f_x.T, weight, f_x])
-    gamma = 1 / ca.fmax(total / size, 1e-12)
-
+    span, bent = _span(lower, upper), ca.SX.sym("W", size)
+    ranges, bends = ([ca.diag(block) for block in _blocks(vector, nu)] for vector in (span, bent))
+    gamma = _scaling(stages, last, ranges)
     costate, weight = gamma * last[4], gamma * last[6]
     gradient: list[Any] = []
     laws: list[tuple[Any, Any]] = []
-    for scale, (f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
+    for scale, bend, (f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu) in zip(reversed(ranges), reversed(bends), reversed(stages), strict=True):
         into = ca.mtimes(f_u, scale)
         ahead = ca.mtimes(into.T, weight)
-        curved = gamma * ca.mtimes([scale, l_uu, scale]) + ca.mtimes(ahead, into) + REGULARISATION * ca.SX.eye(nu)
-        inverse = ca.solve(ca.chol(ca.densify(curved)), ca.SX.eye(nu))
+        block = ca.mtimes([scale, gamma * l_uu + bend, scale]) + ca.mtimes(ahead, into) + REGULARISATION * ca.SX.eye(nu)
+        inverse = ca.solve(ca.chol(ca.densify(block)), ca.SX.eye(nu))
         law = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_ux) + ca.mtimes(ahead, f_x))
         slope = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_u) + ca.mtimes(into.T, costate))
         costate = gamma * l_x + ca.mtimes(f_x.T, costate) - ca.mtimes(law.T, slope)
@@ -295,7 +337,16 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
         span,
         gamma,
     ]
-    return ca.Function("quadratic", [inputs, rows, vector, lower, upper], _cse(*data))
+    return ca.Function("quadratic", [inputs, rows, vector, lower, upper, bent], _cse(*data))
+
+
+def _scaling(stages: list[list[Any]], last: list[Any], ranges: list[Any]) -> Any:
+    """gamma, with which the mean of the scaled Hessian's diagonal is one."""
+    weight, total = last[6], ca.SX(0)
+    for scale, (f_x, f_u, _, _, _, _, l_xx, _, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
+        total += ca.trace(ca.densify(ca.mtimes([scale, l_uu + ca.mtimes([f_u.T, weight, f_u]), scale])))
+        weight = l_xx + ca.mtimes([f_x.T, weight, f_x])
+    return 1 / ca.fmax(total / sum(scale.shape[0] for scale in ranges), 1e-12)
 
 
 def _residual(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:

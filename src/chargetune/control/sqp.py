@@ -4,10 +4,11 @@
     s.t.                 lower <= U <= upper,   (1 + i / N) c_i(U) <= s_j
 
 with one slack s_j for each limit over the whole horizon, c_i its value less its bound at stage i. Each iteration solves
-the QP of the linearised outputs and the stage costs' Hessians (curvature of the dynamics left out, gradient exact) with
-DAQP and goes the full step; while phi rises the step is halved. The first iterate is the shifted solution of the control
-step before. After each iteration the problem is linearised anew and optimality and feasibility are measured THERE, from
-multipliers and derivatives, independently of what the QP solver reports: one that is silently wrong cannot pass.
+the QP of the linearised outputs and the stage costs' Hessians with DAQP (the gradient is exact; of the curvature of
+constraints and dynamics later iterations take the positive diagonal) and goes the full step; while phi rises the step is
+halved. The first iterate is the shifted solution of the control step before. After each iteration the problem is
+linearised anew and optimality and feasibility are measured THERE, from multipliers and derivatives, independently of what
+the QP solver reports: one that is silently wrong cannot pass.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ __all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
 # Of the scaled problem, where 1 is the whole range of an input or one `scale` of a limit: 1e-4 of 6 A is 0.6 mA.
 KKT_TOLERANCE = 1e-4
 HALVINGS_MAX = 6
+# Iterations from this one on take the curvature of constraints and dynamics into account. Gauss-Newton steps are cheaper and
+# mostly converge in one or two; along a limit that is bent in the input, as that of a temperature is, they go back and forth.
+CURVED_FROM = 3
 # Violations of this share of a limit's scale come from the QP solver's own tolerance.
 MERIT_ROUNDING = 1e-9
 
@@ -47,11 +51,13 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     """
     size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.prepare.size1_out(0), _duals(problem)
     step = _iteration(problem, qp)
-    arguments = step.mx_in()
-    *point, dual, kkt = step(*arguments)
+    last_one = problem.controller.iterations_max - 1
+    arguments = step.mx_in()[:-1]
+    *point, dual, kkt = step(*arguments, float(last_one >= CURVED_FROM))
     # Further iterations are nested branches, which cost nothing where the first iterate is a solution.
     more = ca.Function("more", arguments, [point[0], dual, kkt, ca.MX(1.0)])
-    for _ in range(problem.controller.iterations_max - 1):
+    for iteration in reversed(range(last_one)):
+        *point, dual, kkt = step(*arguments, float(iteration >= CURVED_FROM))
         inputs = more.mx_in()
         done = ca.Function("done", inputs, [inputs[1], inputs[5], ca.MX(0.0), ca.MX(0.0)])
         # A NaN is not converged either, hence the negation.
@@ -100,7 +106,10 @@ def _shift(problem: Problem) -> list[int]:
 
 
 def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
-    """One SQP iteration: (now, U, c, D, merit, dual, lower, upper, q) -> (U, c, D, merit, dual, kkt) at the next U."""
+    """One SQP iteration: (now, U, c, D, merit, dual, lower, upper, q, bend) -> (U, c, D, merit, dual, kkt) at the next U.
+
+    With ``bend`` = 1 it takes the curvature of constraints and dynamics into account, with 0 it is Gauss-Newton's.
+    """
     limits = problem.controller.limits
     nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
     now, inputs, c, derivatives = (
@@ -108,14 +117,19 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     )
     merit, dual, q = ca.MX.sym("merit"), ca.MX.sym("dual", _duals(problem)), ca.MX.sym("q", nq)
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
-    *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper)
+    bend = ca.MX.sym("bend")
+    of = problem.curvature.mx_in()
+    straight = ca.Function("straight", of, [ca.DM.zeros(problem.size)])
+    curvature = ca.Function.if_else("curvature", problem.curvature, straight)
+    bent = curvature(bend, now, inputs, derivatives, dual[len(limits) + problem.size :], lower, upper, q)
+    *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper, bent)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
     allowed = merit + KKT_TOLERANCE**2 / gamma + rounding
     point = list(_line_search(problem)(now, inputs, span * values[: problem.size], 1.0, allowed, q))
     kkt = problem.residual(*point[:3], new_dual[len(limits) + problem.size :], gamma, lower, upper)
-    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q], [*point, new_dual, kkt])
+    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual, kkt])
 
 
 def _line_search(problem: Problem) -> ca.Function:

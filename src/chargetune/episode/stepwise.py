@@ -116,7 +116,7 @@ def _assemble(
 
     measured = [r[1] for r in records]
     states = [m.state for m in (*([first] if first else []), *measured)]
-    known = bool(measured) and all(m.true_start is not None for m in measured)
+    known = bool(states) and all(m.true_start is not None for m in (*([first] if first else []), *measured))
     return Episode(
         sampling_time_s=plant.sampling_time_s,
         input_names=tuple(s.name for s in plant.inputs),
