@@ -19,6 +19,7 @@ from chargetune.battery.metrics import charging_metrics
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.control.controller import Controller, SoftLimit, Stage
 from chargetune.control.estimators import Estimator, ExactState, Propagated
+from chargetune.control.mpc import compiled_act
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
@@ -276,7 +277,8 @@ class ChargingProblem:
         """One charge with the controller at theta (None: untuned)."""
         if self._episodes is not None:
             return self._episodes.run(theta, seed)
-        return run_episode(self.controller, self.plant, steps=self.steps, theta=theta, seed=seed)
+        control = compiled_act(self.controller)
+        return run_episode(self.controller, self.plant, steps=self.steps, theta=theta, seed=seed, control=control)
 
     @cached_property
     def _episodes(self) -> CompiledEpisode | None:
