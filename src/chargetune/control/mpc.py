@@ -138,9 +138,10 @@ class _CompiledStep:
             self._theta = key
         self._given[:] = np.concatenate((memory.estimator, received, memory.last_input, memory.warm, self._q))
         self._evaluate()
-        edges = np.cumsum([len(memory.last_input), len(memory.estimator), len(memory.warm), 3])
-        u, ahead, warm, facts, estimate = np.split(self._out.copy(), edges)
-        return u, Memory(ahead, u, warm), Info(SolveStatus(int(facts[0])), float(facts[1]), int(facts[2]), estimate)
+        out, nu, nm = self._out.copy(), len(memory.last_input), len(memory.estimator)
+        facts = nu + nm + len(memory.warm)
+        info = Info(SolveStatus(int(out[facts])), float(out[facts + 1]), int(out[facts + 2]), out[facts + 3 :])
+        return out[:nu], Memory(out[nu : nu + nm], out[:nu], out[nu + nm : facts]), info
 
 
 def _machine_code(problem: Problem) -> ca.Function:

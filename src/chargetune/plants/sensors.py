@@ -58,14 +58,16 @@ class Readout:
     def __init__(self, sensors: Sensors, outputs: tuple[Signal, ...], stream: np.random.Generator) -> None:
         self._sd, self._bias, self._resolution = sensors.vectors(outputs)
         self._stream = stream
+        self._perfect = not (self._sd.any() or self._bias.any() or self._resolution.any())
         self._sent: deque[NDArray[np.float64]] = deque(maxlen=sensors.delay_steps + 1)
 
     def read(self, before: NDArray[np.float64], after: NDArray[np.float64], state: NDArray[np.float64] | None = None) -> Measurement:
         """What is measured of an interval with these true outputs at its two ends; the first call is the plant at rest."""
-        both = np.array([before, after])
-        noise = self._sd * self._stream.standard_normal(both.shape) if self._sd.any() else 0.0
-        raw = both + self._bias + noise
-        step = np.where(self._resolution > 0, self._resolution, 1.0)
-        start, end = np.where(self._resolution > 0, np.floor(raw / step + 0.5) * step, raw)
+        start, end = before, after
+        if not self._perfect:
+            noise = self._sd * self._stream.standard_normal((2, len(before))) if self._sd.any() else 0.0
+            raw = np.array([before, after]) + self._bias + noise
+            step = np.where(self._resolution > 0, self._resolution, 1.0)
+            start, end = np.where(self._resolution > 0, np.floor(raw / step + 0.5) * step, raw)
         self._sent.extend([end] * (1 if self._sent else self._sent.maxlen or 1))
         return Measurement(start, end, self._sent[0], before, after, state)
