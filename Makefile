@@ -43,8 +43,9 @@ types: $(READY) ## mypy, strict
 imports: $(READY) ## the directions of imports between the folders
 	$(BIN)/lint-imports
 
-bench: $(READY) ## speed of the closed loop and of the tuner
+bench: $(READY) ## speed of the closed loop, of the tuner and of the plants
 	$(BIN)/python benchmarks/closed_loop.py
+	$(BIN)/python benchmarks/plants.py
 	$(BIN)/python benchmarks/tuner_overhead.py
 
 # torch keeps the locked version: raise it by hand in requirements.lock, within the range of pyproject.toml.
@@ -53,7 +54,7 @@ lock: ## renew requirements.lock from the ranges in pyproject.toml
 	rm -rf $(LOCK_VENV)
 	$(PYTHON) -m venv $(LOCK_VENV)
 	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)"
-	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench]'
+	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench,pybamm]'
 	{ grep '^#' requirements.lock; \
 	  $(LOCK_VENV)/bin/pip freeze --all --exclude-editable --exclude pip \
 	  | sed 's/+cpu$$//' | grep -Ev '^(cuda|nvidia|triton)'; } > build/requirements.lock

@@ -1,0 +1,125 @@
+"""identify and compare as a user runs them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from chargetune.battery.cell import load_cell
+from chargetune.battery.config import load_config
+from chargetune.cli import main
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def chargetune(*arguments, code=0):
+    done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys):
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 2
+        return capsys.readouterr().err
+
+    return run
+
+
+def test_identify_writes_a_cell_that_a_study_takes(shared, tmp_path):
+    pulses = shared / "data" / "nissanleaf_cell-low-current-hppc-25c-2.csv"
+    discharge = shared / "data" / "nissanleaf_cell-discharge-bitrode-1c.csv"
+    cell, figure = tmp_path / "leaf.toml", tmp_path / "leaf.png"
+    done = chargetune("identify", pulses, "--rc", 2, "-o", cell, "--figure", figure, "--check", discharge, "--name", "Leaf", "--json")
+    found = json.loads(done.stdout)
+    assert len(found["points"]) == 10
+    assert sum(point["rms_mV"] <= 1.2 for point in found["points"]) >= 9
+    assert set(found["points"][0]) >= {"soc", "rms_mV"}
+    assert found["seconds"] < 10
+    assert found["checks"][0]["rms_mV"] < 40
+    assert figure.stat().st_size > 10_000
+    assert load_cell(cell).name == "Leaf"
+    (tmp_path / "study.toml").write_text('[cell]\nfile = "leaf.toml"\n[limits]\ncurrent_max_A = 20.0\n[episode]\nsteps = 20\n')
+    out = json.loads(chargetune("simulate", tmp_path / "study.toml", "--json").stdout)
+    assert out["soc"][-1] > 0.05
+    text = chargetune("identify", pulses, "-o", cell).stdout
+    assert "R0 mΩ" in text
+    assert "capacity 30.5" in text
+
+
+def test_identify_refuses_what_holds_no_circuit(shared, tmp_path, refused):
+    said = refused("identify", shared / "data" / "beep_2017-05-09_test-TC-contact_CH33.csv", "-o", tmp_path / "cell.toml")
+    assert "0 sets of pulses after a rest" in said
+    assert not (tmp_path / "cell.toml").exists()
+    assert "format 'bmp'" in refused("identify", tmp_path / "data.csv", "--figure", "fit.bmp")
+    assert "nothing.csv" in refused("identify", tmp_path / "nothing.csv")
+
+
+QUICK = """
+[study]
+name = "quick"
+tuner = "sobol"
+trials = 5
+[controller]
+mismatch_seed = 1
+[episode]
+steps = 200
+[theta.backoff]
+nodes = 3
+lower_V = 0.0
+upper_V = 0.2
+"""
+
+
+def test_compare_prints_the_table_draws_and_takes_the_tuned_controller(tmp_path):
+    (tmp_path / "quick.toml").write_text(QUICK)
+    chargetune("tune", tmp_path / "quick.toml", "--store", tmp_path / "s.sqlite")
+    figure = tmp_path / "compare.pdf"
+    done = chargetune("compare", tmp_path / "quick.toml", "--store", tmp_path / "s.sqlite", "--figure", figure, "--json", "--workers", 1)
+    rows = {row["name"]: row for row in json.loads(done.stdout)["rows"]}
+    assert list(rows)[-1] == "tuned"
+    assert set(rows["tuned"]) >= {"name", "t80_min", "t90_min", "worst_excess", "breaks_limit"}
+    assert set(rows["tuned"]["worst_excess"]) == {"voltage_mV", "anode_mV", "temperature_K"}
+    assert rows["nominal MPC"]["breaks_limit"]
+    assert not rows["plant oracle"]["breaks_limit"]
+    assert rows["plant oracle"]["t80_min"] == pytest.approx(23.4, abs=0.1)
+    assert figure.stat().st_size > 5_000
+    (tmp_path / "short.toml").write_text(QUICK.replace("steps = 200", "steps = 20"))
+    text = chargetune("compare", tmp_path / "short.toml").stdout
+    assert "plant oracle" in text
+    assert "tuned" not in text.split("--store")[0]
+
+
+def test_compare_refuses_before_it_charges(tmp_path, refused):
+    (tmp_path / "quick.toml").write_text(QUICK)
+    assert "format 'bmp'" in refused("compare", tmp_path / "quick.toml", "--figure", "fit.bmp")
+    assert "nothing.sqlite" in refused("compare", tmp_path / "quick.toml", "--store", tmp_path / "nothing.sqlite")
+
+
+@pytest.mark.parametrize("file", ["dfn_fast_charge.toml", "dfn_fast_charge_cold.toml"])
+def test_the_electrochemical_examples_are_what_they_say(file):
+    problem = load_config(EXAMPLES / file).problem(EXAMPLES)
+    assert problem.plant_model.model == "DFN"
+    assert {limit.name: limit.kind for limit in problem.limits}["anode_min_V"] == "scored"
+    assert problem.sensors.noise_sd == {"voltage_V": 0.002}
+    assert problem.kalman is not None
+    cold = "cold" in file
+    assert problem.plant_model.ambient_K == (283.15 if cold else 298.15)
+
+
+def test_tuning_an_electrochemical_plant_resumes_and_draws(tmp_path):
+    text = (EXAMPLES / "dfn_fast_charge.toml").read_text().replace('"DFN"\n', '"SPM"\n').replace("steps = 360", "steps = 40")
+    (tmp_path / "okane2022.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
+    (tmp_path / "spm.toml").write_text(text)
+    for trials in (2, 3):
+        done = chargetune("tune", tmp_path / "spm.toml", "--trials", trials, "--out", tmp_path / "out", "--json")
+    found = json.loads(done.stdout)
+    assert (found["trials"], found["failed"]) == (3, 0)
+    assert {"temperature_max_excess_K", "anode_min_excess_mV"} <= set(found["untuned"]["metrics"])
+    assert {p.name for p in (tmp_path / "out").glob("*.png")} >= {"trajectories.png", "current_limit.png", "backoff.png"}
