@@ -34,6 +34,7 @@ def test_a_perfect_model_keeps_voltage_temperature_and_anode_potential_and_rides
     score, _ = scored(ANODE, temperature_max_K=HOT, anode_min_V=0.0)
     assert score.feasible
     assert score.metrics["solver_failures"] == 0
+    assert -1e-9 <= score.metrics["current_max_excess_A"] <= 0
     # Each limit is reached somewhere: the charge is as fast as it can be.
     for name, unit in (("voltage_max_V", 1e-4), ("temperature_max_K", 0.02), ("anode_min_V", 1e-4)):
         assert -unit <= score.excess[name] <= unit, name

@@ -297,6 +297,8 @@ class ChargingProblem:
         excess = {limit.name: limit.excess(episode, self.verdict_samples if noisy[limit.name] else 1) for limit in self.limits}
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
+        # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
+        metrics["current_max_excess_A"] = float(np.max(episode.input[:, 0]) - (self.current_max_A or 0.0))
         for limit in self.limits[2:]:
             metrics |= limit.metrics(episode)
         return Score(
