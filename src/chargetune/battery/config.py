@@ -21,9 +21,10 @@ from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.plants.sensors import Sensors
 
-__all__ = ["CASE_STUDIES", "Config", "case_study", "load_config", "problem_of_document"]
+__all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "problem_of_document"]
 
 
+TunerName = Literal["default", "ei", "sobol", "twin"]
 RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
 
@@ -36,7 +37,7 @@ class StudyTable(_Table):
     """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time."""
 
     name: str = Field(default="study", min_length=1, max_length=200)
-    tuner: Literal["default", "ei", "sobol"] = "default"
+    tuner: TunerName = "default"
     trials: int = Field(default=60, ge=1)
     seed: int = Field(default=0, ge=0)
     batch: int = Field(default=1, ge=1)
@@ -305,7 +306,7 @@ CASE_STUDIES: dict[str, ThetaTable] = {
 }
 
 
-def case_study(name: str, mismatch_seed: int, tuner: Literal["default", "ei", "sobol"] = "default", seed: int | None = None) -> Config:
+def case_study(name: str, mismatch_seed: int, tuner: TunerName = "default", seed: int | None = None) -> Config:
     """A study of the paper: theta is the backoff, the model's R1, or both. The tuner's seed is the mismatch seed's."""
     if name not in CASE_STUDIES:
         raise ValueError(f"case study {name!r}, allowed are {', '.join(CASE_STUDIES)}")

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.claims import SeedRun, decide
-from chargetune.battery.config import CASE_STUDIES, Config, case_study, problem_of_document
+from chargetune.battery.config import CASE_STUDIES, Config, TunerName, case_study, problem_of_document
+from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.episode import Episode
 from chargetune.study.store import Store
 from chargetune.study.study import Proposer, Study
 from chargetune.study.trial import Trial, best_feasible, best_performance
 
 __all__ = ["ATTAINABLE_T95_MIN", "make_tuner", "open_study", "reproduce", "seed_row", "seed_run", "summarise", "tuned_trial"]
-
-TunerName = Literal["default", "ei", "sobol"]
 
 # t95 in minutes that 4000 evaluations of CMA-ES reach on seeds 0-7 with U1 propagated by the controller's own model,
 # overshoot at most 0.3 mV (backoff of seed 0: 2.3 mV). For "both" none is known.
@@ -28,8 +28,8 @@ ATTAINABLE_T95_MIN: dict[str, tuple[float, ...]] = {
 }
 
 
-def make_tuner(name: TunerName, seed: int) -> Proposer:
-    """The tuner that a configuration names."""
+def make_tuner(name: TunerName, seed: int, problem: ChargingProblem) -> Proposer:
+    """The tuner that a configuration names; the twin simulates the problem's controller."""
     # torch is needed from here on only.
     from chargetune import learning
 
@@ -37,6 +37,7 @@ def make_tuner(name: TunerName, seed: int) -> Proposer:
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
         "sobol": lambda s: learning.Sobol(seed=s),
+        "twin": lambda s: learning.TwinTuner(ChargingTwin(problem), seed=s),
     }
     return makers[name](seed)
 
@@ -49,7 +50,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None) -> Stud
         config.study.name,
         config=config.document(folder),
         space=problem.space,
-        tuner=make_tuner(config.study.tuner, config.study.seed),
+        tuner=make_tuner(config.study.tuner, config.study.seed, problem),
         seed=config.study.seed,
         batch=config.study.batch,
     )

@@ -37,6 +37,7 @@ class TunerChoice(StrEnum):
     DEFAULT = "default"
     EI = "ei"
     SOBOL = "sobol"
+    TWIN = "twin"
 
 
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
@@ -93,7 +94,7 @@ def reproduce(
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
     trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
     tuner: Annotated[
-        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, or Sobol points.")
+        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, Sobol points, or the twin.")
     ] = TunerChoice.DEFAULT,
     workers: Workers = 2,
     out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 from rich.table import Table
 
-from chargetune.battery.config import case_study
-from chargetune.battery.reproduce import TunerName, reproduce, summarise
+from chargetune.battery.config import TunerName, case_study
+from chargetune.battery.reproduce import reproduce, summarise
 from chargetune.cli.output import console, number
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor

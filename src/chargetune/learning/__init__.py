@@ -5,5 +5,10 @@ from chargetune.learning.expected_improvement import ExpectedImprovement
 from chargetune.learning.sobol import Sobol
 from chargetune.learning.surrogate import GaussianProcess
 from chargetune.learning.tuner import TrialLike, Tuner
+from chargetune.learning.twin import Posterior, Twin, Uncertain
+from chargetune.learning.twin_tuner import TwinTuner
 
-__all__ = ["ConstrainedLogEI", "ExpectedImprovement", "GaussianProcess", "Sobol", "TrialLike", "Tuner"]
+__all__ = [
+    "ConstrainedLogEI", "ExpectedImprovement", "GaussianProcess", "Posterior", "Sobol",
+    "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
+]  # fmt: skip

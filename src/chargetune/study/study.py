@@ -7,13 +7,15 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import score_to_json
@@ -206,10 +208,19 @@ class Study:
         return incumbent
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
-        thetas = np.asarray(self.tuner.ask(self.space, trials, n), dtype=float)
+        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self._episode, t.number)) for t in trials]
+        thetas = np.asarray(self.tuner.ask(self.space, traced, n), dtype=float)
         if thetas.shape != (n, self.space.dimension):
             raise StudyError(f"the tuner proposed an array of shape {thetas.shape}, expected ({n}, {self.space.dimension})")
         return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
+
+    def _episode(self, number: int) -> Episode | None:
+        trace = self.trace(number)
+        try:
+            return None if trace is None else Episode.from_arrays(*trace)
+        except (KeyError, TypeError, ValueError):
+            # A trace of the caller's own shape is kept for the caller, and is nothing that a tuner can read.
+            return None
 
     def _record(self, first: int, thetas: Sequence[tuple[float, ...]]) -> list[Trial]:
         now, made_with = utc_now(), self._provenance()

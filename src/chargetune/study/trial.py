@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -40,6 +40,8 @@ class Trial:
         SHA-256 of the stored trace, None when there is none.
     provenance
         Hash of the study's configuration, versions of the programs, machine.
+    episode
+        Reads the trial's stored episode; a study gives it to its tuner, nobody else has it.
     """
 
     number: int
@@ -52,6 +54,7 @@ class Trial:
     told_at: str | None = None
     trace_sha256: str | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    episode: Callable[[], Any] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.number < 0:

@@ -1,0 +1,89 @@
+"""The twin of a charging problem: the controller's own circuit with unknown resistances and capacitances as plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.episode.compiled import CompiledEpisode, compiled_episode
+from chargetune.episode.episode import Ending
+from chargetune.episode.score import Score
+from chargetune.plants.sensors import Sensors
+from chargetune.plants.simulated import SimulatedPlant
+
+if TYPE_CHECKING:
+    from chargetune.learning.twin import Twin
+
+__all__ = ["ChargingTwin"]
+
+# A voltage sensor without stated noise is trusted to this, V; a temperature sensor to this, K.
+LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05}
+# Windows of the SOC in which a predicted excess is told to the search.
+WINDOWS = 24
+
+
+@dataclass(frozen=True)
+class ChargingTwin:
+    """Closed loops of ``problem`` on circuits whose R and C tables are the controller's own times exp(m).
+
+    ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
+    nothing of the plant: it is centred on what the controller believes.
+    """
+
+    problem: ChargingProblem
+    spread: float = 0.4
+    smooth: float = 0.3
+
+    @cached_property
+    def twin(self) -> Twin:
+        """Unknown tables over SOC; measured voltage, and temperature where the cell has one."""
+        from chargetune.learning.twin import Twin, Uncertain
+
+        problem = self.problem
+        belief = problem.controller_cell
+        model = ecm_model(problem.plant_cell, problem.sampling_time_s).with_parameters(**{n: getattr(belief, n) for n in belief.tables})
+        names = ("voltage_V", *(["temperature_K"] if belief.thermal else []))
+        noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
+        unknowns = tuple(Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables)
+        return Twin(model, unknowns, noise, start_state(belief, problem.soc_start))
+
+    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64]) -> Score | None:
+        """The verdict on one charge without noise."""
+        sizes = self.twin.model.parameter_blocks
+        values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
+        plant = replace(self._loop.plant, model=self._loop.plant.model.with_parameters(**dict(zip(sizes, values, strict=True))))
+        episode = replace(self._loop, plant=plant).run(theta)
+        if episode.ending is not Ending.DONE:
+            return None
+        try:
+            return self._exact.score(episode)
+        except ValueError:
+            return None
+
+    @cached_property
+    def _exact(self) -> ChargingProblem:
+        # Limits that a circuit cannot predict are nothing it could be tuned on.
+        problem, cell = self.problem, self.problem.plant_cell
+        return replace(
+            problem,
+            plant_model=None,
+            soc_windows=WINDOWS,
+            verdict_samples=1,
+            sensors=Sensors(),
+            temperature_max_K=problem.temperature_max_K if cell.thermal else None,
+            anode_min_V=problem.anode_min_V if cell.anode else None,
+        )
+
+    @cached_property
+    def _loop(self) -> CompiledEpisode:
+        problem = self._exact
+        plant = problem.plant
+        if not isinstance(plant, SimulatedPlant):
+            raise TypeError("the twin's plant is a simulated circuit")
+        return compiled_episode(self.problem.controller, plant, problem.steps)
