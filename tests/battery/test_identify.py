@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from chargetune.battery.baselines import triable
 from chargetune.battery.cell import default_cell, load_cell
@@ -191,6 +192,20 @@ def test_a_slow_ocv_by_hand():
     slow = Record("slow", time, current, voltage)
     cell = identify(measured(TRUE), capacity_Ah=2.0, ocv=slow).cell
     np.testing.assert_allclose(cell.ocv_V, 3 + np.array(cell.ocv_soc), atol=5e-3)
+
+
+def test_a_slow_ocv_gives_the_circuit_up_to_the_full_end():
+    """Rests alone do not hold the slope of the OCV where the cell is full; a charge and discharge at C/50 do."""
+    ocv, passed, seconds = PchipInterpolator(TRUE.ocv_soc, TRUE.ocv_V), np.linspace(0, 1, 2001), 50 * 3600.0
+    slow = Record(
+        "slow",
+        np.concatenate([[0.0], 1 + passed * seconds, 2 + seconds + passed * seconds]),
+        np.concatenate([[0.0], np.full(2001, 0.04), np.full(2001, -0.04)]),
+        np.concatenate([[ocv(0.0)], ocv(passed) + 0.002, ocv(1 - passed) - 0.002]),
+    )
+    found = identify(measured(TRUE), ocv=slow)
+    np.testing.assert_allclose([fit.values["R1_ohm"] for fit in found.fits], 0.02, rtol=0.03)
+    assert not any("mV apart" in remark for remark in found.remarks)
 
 
 @pytest.mark.parametrize(

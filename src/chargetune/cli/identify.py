@@ -66,8 +66,9 @@ def identify_command(
     for remark in found.remarks:
         screen.print(remark, style="dim", markup=False, soft_wrap=True)
     for file, rate, rms, worst in checks:
-        screen.print(f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst", soft_wrap=True)
-    screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), soft_wrap=True)
+        line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
+        screen.print(line, markup=False, soft_wrap=True)
+    screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
 
 
 def _check(found: Identification, record: Record) -> tuple[float, float, float]:
