@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from chargetune.battery.baselines import charge, constant_current
-from chargetune.battery.cyclers import Record
 from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.identify import cell_toml, identify
 from chargetune.battery.identify_thermal import activation_energy, with_thermal
 from chargetune.battery.limits import Limit
 from chargetune.battery.pulse_test import pulse_test
+from chargetune.battery.record import Record
 from chargetune.plants.sensors import Sensors
 
 

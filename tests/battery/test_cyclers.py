@@ -31,6 +31,18 @@ DIALECTS = {
     "Neware": table(
         "Record ID;Time;Current(mA);Voltage(V)", lambda t, i, v: ["1", f"{t % 20 if t else 0}", comma(1000.0 * i), comma(v)], ";"
     ),
+    "Neware h:min:s.ms": table(
+        "Record Index,Relative Time(h:min:s.ms),Cur(mA),Voltage(V)", lambda t, i, v: ["1", f"0:00:{t:02d}.000", f"{1000 * i}", f"{v}"]
+    ),
+    "decimal commas everywhere": table("Time(s);Current(A);Voltage(V)", lambda t, i, v: [comma(float(t)), comma(float(i)), comma(v)], ";"),
+    "decimal commas, tabs, a long preamble": table(
+        "time/s\tI/mA\tEwe/V",
+        lambda t, i, v: [comma(float(t)), comma(1000.0 * i), comma(v)],
+        "\t",
+        ["EC-Lab ASCII FILE", "a remark, with, many, commas, in, it, , , , , , , , , , , , ,"],
+    ),
+    "quoted decimal commas": table('"Time(s)","Current(A)","Voltage(V)"', lambda t, i, v: [f'"{comma(float(x))}"' for x in (t, i, v)]),
+    "BDF of machines": table("test_time_second,voltage_volt,current_ampere", lambda t, i, v: [f"{t}", f"{v}", f"{i}"]),
     "Neware clock": table("Total Time,Current(A),Voltage(V)", lambda t, i, v: [f"0:00:{t:02d}", f"{i}", f"{v}"]),
     "BioLogic": table(
         "mode\ttime/s\tEcell/V\tI/mA",
@@ -64,6 +76,16 @@ def test_every_dialect_reads_the_same(dialect, mark, tmp_path):
     assert any("sign" in remark for remark in record.remarks) == (dialect == "reversed sign")
 
 
+def test_a_temperature_with_holes_is_left_out(tmp_path):
+    path = tmp_path / "data.csv"
+    path.write_text(DIALECTS["Arbin"].replace("3.71,25.0", "3.71,"))
+    record = read_record(path)
+    assert record.temperature_K is None
+    assert "row 5: Temperature = ''" in record.remarks[0]
+    path.write_text(DIALECTS["Arbin"].replace("Temperature", "Temperature / K").replace("25.0", "300"))
+    np.testing.assert_allclose(read_record(path).temperature_K, 300.0)
+
+
 def test_charge_by_hand(tmp_path):
     path = tmp_path / "data.csv"
     path.write_text(DIALECTS["BDF"])
@@ -76,7 +98,7 @@ BDF = DIALECTS["BDF"]
 REFUSED = {
     "empty": ("", ("is empty",)),
     "only a header": ("Time(s),Current(A),Voltage(V)\n", ("0 rows of numbers", "at least 2")),
-    "wrong columns": ("a,b,c\n1,2,3\n2,3,4\n", ("no column for time, current, voltage", "a, b, c")),
+    "wrong columns": ("a,b,c\n1,2,3\n2,3,4\n", ("no column for time, current, voltage", "a,b,c")),
     "misspelt column": (BDF.replace("Voltage", "Volatge"), ("no column for voltage", "Volatge")),
     "not a number": (BDF.replace("3.71", "n/a"), ("row 5", "Voltage / V = 'n/a'", "a number")),
     "not finite": (BDF.replace("3.71", "nan"), ("row 5", "'nan'", "finite")),
@@ -84,8 +106,21 @@ REFUSED = {
         BDF.replace("\n40,", "\n250,").replace("\n50,", "\n400,").replace("\n30,", "\n300,"),
         ("sample 5", "after 300 s", "increasing"),
     ),
+    "time falls a little": (BDF.replace("\n20,", "\n9,"), ("sample 3", "time = 9 s after 10 s", "increasing")),
     "time stands": ("Time(s),Current(A),Voltage(V)\n" + "5,1,3.6\n" * 20 + "6,0,3.5\n", ("time stands at 5 s",)),
     "a gap": (BDF.replace("\n30,", "\n900,").replace("\n40,", "\n910,").replace("\n50,", "\n920,"), ("sample 4", "gap of 880 s", "300 s")),
+    "a gap before a current": (
+        BDF.replace("\n20,", "\n820,").replace("\n30,", "\n830,").replace("\n40,", "\n840,").replace("\n50,", "\n850,"),
+        ("sample 3", "gap of 810 s", "300 s"),
+    ),
+    "bare decimal commas": ("Time(s),Current(A),Voltage(V)\n0,0,1,5,3,7\n1,0,1,5,3,8\n", ("row 2 has 6 cells", "3 as in the header")),
+    "two decimal marks": ("Time(s);Current(A);Voltage(V)\n0,0;1.5;3,7\n", ("row 2", "'1.5'", "other decimal mark")),
+    "unknown unit": (BDF.replace("Voltage / V", "Voltage / kV"), ("no column for voltage", "Known names and units")),
+    "a lost contact": (BDF.replace("3.71", "0.0"), ("sample 4", "voltage is 0 V")),
+    "current without a sign": (
+        "Time(s),Current(A),Voltage(V)\n0,0,3.6\n1,2,3.5\n2,2,3.49\n3,0,3.58\n4,2,3.7\n5,0,3.6\n",
+        ("rises with the current in 2 jumps and falls in 2", "a current with a sign"),
+    ),
     "millivolts": (BDF.replace(",3.", ",3"), ("allowed is 0 to 10 V", "mV?")),
     "milliamperes": (BDF.replace(",1.5", ",15000"), ("largest current is 15000 A", "mA?")),
     "no current": (BDF.replace(",1.5", ",0"), ("largest current is 0 A",)),

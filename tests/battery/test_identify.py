@@ -1,19 +1,22 @@
 """Identification: known cells come back, real pulses are fitted as well as they can be, what data do not hold is refused."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from chargetune.battery.baselines import triable
 from chargetune.battery.cell import default_cell, load_cell
 from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.cyclers import Record, read_record
+from chargetune.battery.cyclers import read_record
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.identify import cell_toml, identify, predicted_voltage
 from chargetune.battery.identify_thermal import activation_energy, with_thermal
 from chargetune.battery.pulse_test import pulse_test, record_csv
-from chargetune.battery.pulses import find_pulse_sets, segments
+from chargetune.battery.pulses import find_pulse_sets, groups, segments
+from chargetune.battery.record import Record, checked
 from chargetune.battery.thermal import Anode, Thermal
 from chargetune.plants.simulated import SimulatedPlant
 
@@ -51,15 +54,16 @@ def test_the_stated_standard_deviation_is_that_of_repetitions():
     for seed in range(12):
         noise = 1e-3 * np.random.default_rng(seed).standard_normal(len(exact))
         fit = identify(replace(exact, voltage_V=exact.voltage_V + noise), capacity_Ah=2.0).fits[2]
-        values.append(fit.values["R1_ohm"])
-        stated.append(fit.sd["R1_ohm"])
-    assert 0.5 < np.std(values) / np.mean(stated) < 2.0
+        values.append([fit.values["R1_ohm"], fit.values["C1_F"], fit.ocv_V])
+        stated.append([fit.sd["R1_ohm"], fit.sd["C1_F"], fit.sd["ocv_V"]])
+    ratio = np.std(values, axis=0) / np.mean(stated, axis=0)
+    assert np.all((ratio > 0.5) & (ratio < 2.0)), ratio
 
 
 def test_capacity_is_the_charge_between_full_and_empty():
     found = identify(measured(TRUE))
     assert found.cell.capacity_Ah == pytest.approx(2.0, rel=0.02)
-    assert "capacity" in found.remarks[0]
+    assert any("capacity" in remark for remark in found.remarks)
     with pytest.raises(ValueError, match=r"capacity_Ah = 1, allowed is at least"):
         identify(measured(TRUE), capacity_Ah=1.0)
 
@@ -73,6 +77,55 @@ def test_pulses_and_rests_are_found():
         assert pulses.current_A[0] == 0.0
         assert pulses.time_s[-1] - pulses.time_s[0] == pytest.approx(110.0)
         assert [sign for *_, sign in segments(pulses)] == [0, -1, 0, 1]
+
+
+def several_rates(cell, noise_V):
+    """Three sets of pulses of three currents at each of six SOC, with 20 minutes of rest between them."""
+    plants = {seconds: triable(SimulatedPlant(ecm_model(cell, seconds), start_state(cell, 1.0))) for seconds in (0.5, 10.0, 60.0)}
+    state, rows = plants[0.5].start, [(0.0, 0.0, 0.0)]
+    for _ in range(6):
+        pulses = [part for rate in (1, 2, 3) for part in ((0.5, -rate, 10), (0.5, 0, 40), (0.5, 0.75 * rate, 10), (60.0, 0, 1200))]
+        for step, rate, seconds in ((60.0, 0, 3600), *pulses, (10.0, -1 / 3, 1500)):
+            for _ in range(round(seconds / step)):
+                _, end, state = plants[step].ahead(state, rate * cell.capacity_Ah)
+                rows.append((rows[-1][0] + step, rate * cell.capacity_Ah, float(end[0])))
+    time, current, voltage = np.array(rows[1:]).T
+    noise = noise_V * np.random.default_rng(0).standard_normal(time.size)
+    return Record("several rates", time, current, np.round(voltage + noise, 3))
+
+
+def test_pulses_of_several_currents_make_one_node_at_each_soc():
+    found = identify(several_rates(TRUE, 3e-4), capacity_Ah=2.0)
+    assert len(found.fits) == 18
+    assert len(found.cell.soc) == 6
+    assert np.all(np.diff(found.cell.soc) > 0.1)
+    np.testing.assert_allclose(found.cell.R0_ohm, 0.03, rtol=0.03)
+    # Not at the full end, as above.
+    np.testing.assert_allclose(found.cell.R1_ohm[:-1], 0.02, rtol=0.12)
+    assert groups(np.array([0.1, 0.11, 0.121, 0.13, 0.5]))[1].tolist() == [2, 3]
+
+
+def test_a_rest_logged_without_its_end_gives_the_same_cell():
+    record = measured(TRUE)
+    rest = np.abs(record.current_A) < record.rest_A
+    last = np.append(rest[:-1] & ~rest[1:] & (np.diff(record.time_s, prepend=0.0)[:-1] > 30), False)
+    sparse = Record("sparse", *(values[~last] for values in (record.time_s, record.current_A, record.voltage_V)))
+    assert len(sparse) == len(record) - 6
+    found, whole = identify(checked(sparse)), identify(record)
+    for name in ("R0_ohm", "R1_ohm", "C1_F", "ocv_V"):
+        np.testing.assert_allclose(getattr(found.cell, name), getattr(whole.cell, name), rtol=1e-6)
+
+
+def test_pulses_that_do_not_reach_an_end_are_told():
+    found = identify(measured(TRUE, points=6), capacity_Ah=2.3)
+    assert any("the pulses reach from SOC 0.2" in remark for remark in found.remarks)
+
+
+def test_any_name_makes_a_file(tmp_path):
+    for name in ('line\nbreak = "1"', "tab\t\\ \x7f \u2028 Zelle µ"):
+        path = tmp_path / "cell.toml"
+        path.write_text(cell_toml(replace(TRUE, name=name, remark=name), notes=[name]), encoding="utf-8")
+        assert (load_cell(path).name, load_cell(path).remark) == (name, name)
 
 
 def test_a_file_there_and_back(tmp_path):
@@ -97,6 +150,7 @@ def test_real_pulses(rc, allowed_mV, shared):
     assert len(found.fits) == 10
     assert sum(1e3 * fit.rms_V <= allowed_mV for fit in found.fits) >= 9
     assert found.seconds < 10
+    assert not any("the pulses reach" in remark for remark in found.remarks)
     # A controller takes the cell as it is, and charges with it.
     problem = ChargingProblem(found.cell, mismatch_seed=None, current_max_A=30.0, steps=30)
     assert problem.score(problem.episode()).metrics["soc_end"] > 0.05
@@ -124,20 +178,34 @@ def test_ocv_from_a_slow_charge_and_discharge(shared):
     z = np.linspace(0.15, 0.95, 17)
     of = [np.interp(z, c.ocv_soc, c.ocv_V) for c in (rested.cell, between.cell)]
     np.testing.assert_allclose(of[1], of[0], atol=0.03)
-    # This charge and discharge are half a volt apart, and the person is told.
-    assert any("apart" in remark for remark in between.remarks)
+    # This charge and discharge are half a volt apart where they end, and the person is told.
+    assert any("mV apart (at SOC" in remark for remark in between.remarks)
 
 
 def test_a_slow_ocv_by_hand():
     """OCV 3 + z, polarisation 0.1 ohm, charged with 1 A and discharged with 2 A."""
     passed = np.linspace(0, 1, 500)
-    hours = 3600.0
+    hours = 2 * 3600.0
     time = np.concatenate([[0.0], 1.0 + passed * hours, 1.0 + hours + passed * hours / 2 + 1.0])
     current = np.concatenate([[0.0], np.full(500, 1.0), np.full(500, -2.0)])
     voltage = np.concatenate([[3.0], 3 + passed + 0.1, 4 - passed - 0.2])
     slow = Record("slow", time, current, voltage)
     cell = identify(measured(TRUE), capacity_Ah=2.0, ocv=slow).cell
     np.testing.assert_allclose(cell.ocv_V, 3 + np.array(cell.ocv_soc), atol=5e-3)
+
+
+def test_a_slow_ocv_gives_the_circuit_up_to_the_full_end():
+    """Rests alone do not hold the slope of the OCV where the cell is full; a charge and discharge at C/50 do."""
+    ocv, passed, seconds = PchipInterpolator(TRUE.ocv_soc, TRUE.ocv_V), np.linspace(0, 1, 2001), 50 * 3600.0
+    slow = Record(
+        "slow",
+        np.concatenate([[0.0], 1 + passed * seconds, 2 + seconds + passed * seconds]),
+        np.concatenate([[0.0], np.full(2001, 0.04), np.full(2001, -0.04)]),
+        np.concatenate([[ocv(0.0)], ocv(passed) + 0.002, ocv(1 - passed) - 0.002]),
+    )
+    found = identify(measured(TRUE), ocv=slow)
+    np.testing.assert_allclose([fit.values["R1_ohm"] for fit in found.fits], 0.02, rtol=0.03)
+    assert not any("mV apart" in remark for remark in found.remarks)
 
 
 @pytest.mark.parametrize(
@@ -147,6 +215,11 @@ def test_a_slow_ocv_by_hand():
         (lambda: identify(measured(TRUE), rc=2), "do not hold R1_ohm|do not hold R2_ohm|do not hold tau"),
         (lambda: identify(measured(TRUE), rc=3), r"rc = 3, allowed is 1 or 2"),
         (lambda: identify(measured(TRUE), ocv=measured(TRUE).part(0, 50)), "no charge with current"),
+        (lambda: identify(measured(TRUE), ocv=measured(TRUE)), r"passes 0\.0\d+ Ah, allowed is within 10 % of the capacity of"),
+        (lambda: identify(measured(TRUE), capacity_Ah=4.0), r"do not hold the OCV; they reach from SOC 0\.5\d to 1\.00"),
+        (lambda: identify(measured(TRUE), capacity_Ah=math.nan), r"capacity_Ah = nan, allowed is \(0, 1000\] Ah"),
+        (lambda: identify(measured(TRUE), capacity_Ah=True), r"capacity_Ah = True, allowed is \(0, 1000\] Ah"),
+        (lambda: identify(measured(replace(TRUE, C1_F=(50_000.0,) * 3))), r"at SOC 1\.00: the data do not hold tau1_s; .* longer pulses"),
         (lambda: with_thermal(TRUE, measured(TRUE), 1.0), "no column for the temperature"),
         (lambda: activation_energy({298.15: TRUE}), "at least 2"),
     ],

@@ -1,6 +1,7 @@
 """identify and compare as a user runs them."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,9 @@ def test_identify_writes_a_cell_that_a_study_takes(shared, tmp_path):
     assert found["checks"][0]["rms_mV"] < 40
     assert figure.stat().st_size > 10_000
     assert load_cell(cell).name == "Leaf"
+    # The file says where its numbers come from.
+    assert re.search(rf"{pulses.name}: 10 SOC points, 2-RC, rms at most 0\.\d\d mV\. Fitted 20\d\d-\d\d-\d\d\.", load_cell(cell).remark)
+    assert "# 3 V to 4.203 V and 30 A are the extremes of the record" in cell.read_text()
     (tmp_path / "study.toml").write_text('[cell]\nfile = "leaf.toml"\n[limits]\ncurrent_max_A = 20.0\n[episode]\nsteps = 20\n')
     out = json.loads(chargetune("simulate", tmp_path / "study.toml", "--json").stdout)
     assert out["soc"][-1] > 0.05
@@ -59,6 +63,10 @@ def test_identify_refuses_what_holds_no_circuit(shared, tmp_path, refused):
     assert not (tmp_path / "cell.toml").exists()
     assert "format 'bmp'" in refused("identify", tmp_path / "data.csv", "--figure", "fit.bmp")
     assert "nothing.csv" in refused("identify", tmp_path / "nothing.csv")
+    # A check that cannot be made leaves no cell behind.
+    pulses = shared / "data" / "nissanleaf_cell-low-current-hppc-25c-2.csv"
+    assert "no discharge of at least half" in refused("identify", pulses, "-o", tmp_path / "cell.toml", "--check", pulses)
+    assert not (tmp_path / "cell.toml").exists()
 
 
 QUICK = """

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, Literal
 
 import casadi as ca
@@ -13,30 +14,36 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares, nnls
 
-from chargetune.battery.cell import VOLTAGE_ABOVE_FULL_V, Cell
-from chargetune.battery.cyclers import Record
+from chargetune.battery.cell import CAPACITY_MAX_AH, VOLTAGE_ABOVE_FULL_V, Cell
+from chargetune.battery.checks import check_number
 from chargetune.battery.ecm import ecm_model
-from chargetune.battery.pulses import PulseSet, find_pulse_sets, segments
+from chargetune.battery.open_circuit import ocv_from_rests, ocv_from_slow
+from chargetune.battery.pulses import PULSE_MAX_S, REST_MIN_S, PulseSet, find_pulse_sets, groups
+from chargetune.battery.record import Record
 
 __all__ = ["Identification", "PulseFit", "cell_toml", "identify", "predicted_voltage"]
 
 # Time constants that pulses of some ten seconds can tell, s: the first pair, and both where there are two.
-TIME_CONSTANTS_S = {1: ((2.0, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
+TIME_CONSTANTS_S = {1: ((0.5, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
+RESISTANCES_OHM = (1e-7, 1.0)
 # A standard deviation of more than this share says that the data do not hold the parameter.
 SPREAD_MAX = 1.0
 GRID = 12
 # More than any sensor's noise, mV.
 OFFSET_MAX_MV = 20.0
-# A charge and a discharge farther apart are not slow, V.
-OCV_SPREAD_V = 0.1
+# Nearer to a bound than this, in logarithm, the bound and not the data gave the value.
+AT_BOUND = 0.01
+# Pulses that leave more of the SOC than this at one end leave the person a remark.
+UNCOVERED_TOLD = 0.1
 
 
 @dataclass(frozen=True)
 class PulseFit:
     """One set of pulses: SOC in its middle, OCV before it (V), parameters and their standard deviations by name, rms (V).
 
-    The standard deviations come from the Jacobian at the solution, s^2 (J'J)^-1 with s^2 the mean squared residual: they
-    hold for independent noise, so they are too small where the circuit itself does not fit.
+    The standard deviations come from the Jacobian at the solution, s^2 (J'J)^-1 with s^2 the sum of squared residuals over
+    the degrees of freedom: they hold for independent noise, so they are too small where the circuit itself does not fit.
+    ``sd`` also has that of ``ocv_V``.
     """
 
     soc: float
@@ -75,78 +82,30 @@ def identify(
     sets = find_pulse_sets(record)
     if len(sets) < 3:
         raise ValueError(
-            f"{record.source}: {len(sets)} sets of pulses after a rest; to identify R0, R1 and C1 over SOC at least 3 are needed"
+            f"{record.source}: {len(sets)} sets of pulses after a rest; to identify R0, R1 and C1 over SOC at least 3 are needed "
+            f"(pulses of at most {PULSE_MAX_S:g} s after rests of at least {REST_MIN_S:g} s)"
         )
     charge = record.charge_Ah
     span = float(np.max(charge[sets[0].first :]) - np.min(charge[sets[0].first :]))
-    capacity = span if capacity_Ah is None else capacity_Ah
+    capacity = span if capacity_Ah is None else check_number("capacity_Ah", capacity_Ah, 0.0, CAPACITY_MAX_AH, "Ah", open_low=True)
     if capacity < 0.999 * span:
         raise ValueError(f"capacity_Ah = {capacity:g}, allowed is at least {span:.4g} Ah, the charge that the record passes")
     soc = 1.0 + (charge - float(np.max(charge[sets[0].first :]))) / capacity
-    remarks = [*record.remarks]
+    remarks = [*record.remarks, "SOC 1 is the fullest point of the record"]
     if capacity_Ah is None:
         remarks.append(f"capacity {capacity:.4g} Ah is the charge between the fullest and the emptiest point of the record")
-    grid, volts = _rests(record, sets, soc) if ocv is None else _slow(ocv, remarks)
+    grid, volts = ocv_from_rests(record, sets, soc) if ocv is None else ocv_from_slow(ocv, capacity, remarks)
     curve = PchipInterpolator(grid, volts, extrapolate=True)
     fits = [_fit(record, part, soc, curve, rc) for part in sets]
+    least, most = (pick(fit.soc for fit in fits) for pick in (min, max))
+    if least > UNCOVERED_TOLD or most < 1 - UNCOVERED_TOLD:
+        remarks.append(f"the pulses reach from SOC {least:.2f} to {most:.2f}; beyond, the circuit is that of the nearest of them")
     cell = _cell(record, fits, capacity, (grid, volts), rc, name or record.source)
+    remarks.append(
+        f"{cell.voltage_min_V:g} V to {cell.voltage_max_V:g} V and {cell.current_max_A:g} A are the extremes of the record; "
+        "the limits of the data sheet belong in their place"
+    )
     return Identification(cell, tuple(fits), tuple(remarks), time.perf_counter() - began)
-
-
-def _rests(record: Record, sets: list[PulseSet], soc: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """OCV from the rests before the pulses, and from the last discharge towards empty."""
-    points = sorted({round(float(soc[s.first]), 6): float(record.voltage_V[s.first]) for s in sets}.items())
-    z, v = (np.array(column) for column in zip(*points, strict=True))
-    low = int(np.argmin(soc[sets[0].first :])) + sets[0].first
-    if soc[low] < z[0] - 0.02:
-        # At the end of a discharge the cell is polarised as much as at the last rest by the same current.
-        parts = [p for p in segments(record) if p[0] <= low < p[1]]
-        before = float(record.voltage_V[parts[0][0] - 1] - record.voltage_V[parts[0][0]])
-        z = np.concatenate([[soc[low]], z])
-        v = np.concatenate([[min(record.voltage_V[low] + max(before, 0.0), v[0] - 1e-3)], v])
-    return _covering(z, v)
-
-
-def _slow(ocv: Record, remarks: list[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """OCV between the longest charge and discharge at equal charge.
-
-    With V_c = OCV + R I_c and V_d = OCV - R I_d it is (V_c I_d + V_d I_c) / (I_c + I_d): their mean where the currents
-    are equal, and right also where the charge tapers at constant voltage.
-    """
-    longest: dict[int, tuple[int, int]] = {}
-    for first, last, sign in segments(ocv):
-        if sign and (sign not in longest or last - first > longest[sign][1] - longest[sign][0]):
-            longest[sign] = (first, last)
-    curves = []
-    for sign in (1, -1):
-        if sign not in longest:
-            raise ValueError(f"{ocv.source}: no {'charge' if sign > 0 else 'discharge'} with current, so it holds no OCV curve")
-        part = ocv.part(*longest[sign])
-        passed = part.charge_Ah
-        z = (passed - passed.min()) / (passed.max() - passed.min())
-        order = np.argsort(z, kind="stable")
-        curves.append((z[order], part.voltage_V[order], np.abs(part.current_A[order])))
-    grid = np.concatenate([np.linspace(0.0, 0.1, 11), np.linspace(0.15, 0.95, 17), [1.0]])
-    (v_c, i_c), (v_d, i_d) = ([np.interp(grid, z, values) for values in (v, i)] for z, v, i in curves)
-    between = (v_c * i_d + v_d * i_c) / (i_c + i_d)
-    remarks.append(f"OCV lies between the charge and the discharge in {ocv.source}")
-    apart = float(np.max(v_c - v_d))
-    if apart > OCV_SPREAD_V:
-        remarks.append(f"these are up to {1e3 * apart:.0f} mV apart, so this OCV is no better than a tenth of that")
-    return _covering(grid, np.maximum.accumulate(between))
-
-
-def _covering(z: NDArray[np.float64], v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The table from SOC 0 to 1, strictly increasing; its ends go on with the slope beside them."""
-    keep = np.concatenate([[True], np.diff(z) > 1e-4])
-    z, v = np.clip(z[keep], 0.0, 1.0), v[keep]
-    if z[0] > 0:
-        z, v = np.concatenate([[0.0], z]), np.concatenate([[v[0] - z[0] * (v[1] - v[0]) / (z[1] - z[0])], v])
-    if z[-1] < 1:
-        z, v = np.concatenate([z, [1.0]]), np.concatenate([v, [v[-1] + (1 - z[-1]) * (v[-1] - v[-2]) / (z[-1] - z[-2])]])
-    for k, (low, high) in enumerate(pairwise(v.copy())):
-        v[k + 1] = max(high, v[k] + 1e-4) if high <= max(low, v[k]) else high
-    return z, v
 
 
 def _response(t: NDArray[np.float64], current: NDArray[np.float64], tau: float) -> NDArray[np.float64]:
@@ -173,32 +132,45 @@ def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, r
 
     ranges = TIME_CONSTANTS_S[rc]
     start = _start(t, current, overpotential, ranges)
-    lower = np.append(np.log([1e-7, *(b for low, _ in ranges for b in (1e-7, low))]), -OFFSET_MAX_MV)
-    upper = np.append(np.log([1.0, *(b for _, high in ranges for b in (1.0, high))]), OFFSET_MAX_MV)
+    names = ["R0_ohm", *(name for k in range(1, rc + 1) for name in (f"R{k}_ohm", f"tau{k}_s"))]
+    bounds = dict(zip(names, (RESISTANCES_OHM, *(pair for taus in ranges for pair in (RESISTANCES_OHM, taus))), strict=True))
+    lower, upper = (np.append(np.log([pair[end] for pair in bounds.values()]), OFFSET_MAX_MV * (2 * end - 1)) for end in (0, 1))
     found = least_squares(
         lambda x: model(x) - overpotential, np.clip(np.append(start, 0.0), lower + 1e-6, upper - 1e-6), bounds=(lower, upper), x_scale=1.0
     )
     rms = float(np.sqrt(np.mean(found.fun**2)))
-    names = ["R0_ohm", *(name for k in range(1, rc + 1) for name in (f"R{k}_ohm", f"tau{k}_s"))]
-    _, sizes, directions = np.linalg.svd(found.jac, full_matrices=False)
-    spread = np.sqrt(np.sum((directions / np.maximum(sizes, 1e-12)[:, None]) ** 2, axis=0) * np.mean(found.fun**2))
-    # Logarithms are fitted, so these are relative; the last one is the offset's.
-    for label, relative in zip(names, spread[:-1], strict=True):
-        if not relative <= SPREAD_MAX:
+    # Logarithms are fitted, so the spreads are relative; the last unknown is the offset.
+    covariance = _covariance(found.jac, found.fun)
+    spread = np.sqrt(np.diag(covariance))
+    for i, (label, (least, most)) in enumerate(bounds.items()):
+        if not spread[i] <= SPREAD_MAX:
             raise ValueError(
-                f"{place}: the data do not hold {label} (standard deviation {100 * relative:.0f} % of it); "
+                f"{place}: the data do not hold {label} (standard deviation {100 * spread[i]:.0f} % of it); "
                 f"longer pulses, faster sampling or {'--rc 1' if rc == 2 else 'larger currents'} would"
             )
+        if min(found.x[i] - lower[i], upper[i] - found.x[i]) < AT_BOUND:
+            raise ValueError(
+                f"{place}: the data do not hold {label}; its fit ends at {np.exp(found.x[i]):.3g}, allowed is {least:g} to {most:g}; "
+                f"{'faster sampling' if found.x[i] - lower[i] < AT_BOUND else 'longer pulses'}"
+                f"{' or --rc 1' if rc == 2 else ''} would"
+            )
     values = dict(zip(names, np.exp(found.x[:-1]).tolist(), strict=True))
-    sd = {label: values[label] * float(s) for label, s in zip(names, spread[:-1], strict=True)}
+    sd = {label: values[label] * float(s) for label, s in zip(names, spread[:-1], strict=True)} | {"ocv_V": 1e-3 * float(spread[-1])}
     for k in range(1, rc + 1):
-        r, tau = values[f"R{k}_ohm"], values[f"tau{k}_s"]
-        values[f"C{k}_F"] = tau / r
-        relative = np.hypot(sd[f"R{k}_ohm"] / r, sd[f"tau{k}_s"] / tau)
-        sd[f"C{k}_F"] = values[f"C{k}_F"] * float(relative)
+        r, tau = names.index(f"R{k}_ohm"), names.index(f"tau{k}_s")
+        values[f"C{k}_F"] = values[f"tau{k}_s"] / values[f"R{k}_ohm"]
+        sd[f"C{k}_F"] = values[f"C{k}_F"] * float(np.sqrt(covariance[r, r] + covariance[tau, tau] - 2 * covariance[r, tau]))
     middle = float(np.clip(np.mean(z), 0.0, 1.0))
     fitted = pulses.voltage_V - overpotential + model(found.x)
     return PulseFit(middle, float(pulses.voltage_V[0] + 1e-3 * found.x[-1]), values, sd, rms, t, pulses.voltage_V, fitted)
+
+
+def _covariance(jacobian: NDArray[np.float64], residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """s^2 (J'J)^-1, very large (not infinite) along what the data do not hold. Shape (p, p)."""
+    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)
+    scaled = directions / np.maximum(sizes, 1e-12)[:, None]
+    freedom = max(residuals.size - jacobian.shape[1], 1)
+    return np.asarray(scaled.T @ scaled * (np.sum(residuals**2) / freedom), dtype=np.float64)
 
 
 def _start(
@@ -222,13 +194,15 @@ def _cell(
     record: Record, fits: list[PulseFit], capacity: float, ocv: tuple[NDArray[np.float64], NDArray[np.float64]], rc: int, name: str
 ) -> Cell:
     ordered = sorted(fits, key=lambda fit: fit.soc)
+    # A spline through two sets at nearly one SOC would follow their noise.
+    near = groups(np.array([fit.soc for fit in ordered]))
     table = {
-        key: tuple(float(fit.values[key]) for fit in ordered)
+        key: tuple(float(np.mean([ordered[i].values[key] for i in group])) for group in near)
         for key in ("R0_ohm", *(k for i in range(1, rc + 1) for k in (f"R{i}_ohm", f"C{i}_F")))
     }
     worst = 1e3 * max(fit.rms_V for fit in fits)
     highest, lowest = float(np.max(record.voltage_V)), float(np.min(record.voltage_V))
-    made = f"Identified from the pulses in {record.source}: {len(fits)} SOC points, {rc}-RC, rms at most {worst:.2f} mV."
+    made = f"Identified from the pulses in {record.source}: {len(near)} SOC points, {rc}-RC, rms at most {worst:.2f} mV."
     return Cell(
         name=name,
         capacity_Ah=round(capacity, 6),
@@ -236,7 +210,7 @@ def _cell(
         current_max_A=float(np.max(np.abs(record.current_A))),
         voltage_min_V=round(min(lowest, float(ocv[1][0])), 3),
         voltage_max_V=min(highest, np.floor(1e3 * (ocv[1][-1] + VOLTAGE_ABOVE_FULL_V)) / 1e3),
-        soc=tuple(fit.soc for fit in ordered),
+        soc=tuple(float(np.mean([ordered[i].soc for i in group])) for group in near),
         ocv_soc=tuple(float(z) for z in ocv[0]),
         ocv_V=tuple(float(v) for v in ocv[1]),
         remark=made,
@@ -244,16 +218,20 @@ def _cell(
     )
 
 
-def cell_toml(cell: Cell) -> str:
-    """The cell as the file that `load_cell` reads."""
+def cell_toml(cell: Cell, notes: Sequence[str] = ()) -> str:
+    """The cell as the file that `load_cell` reads, with ``notes`` as comments at its top."""
 
     def row(values: tuple[float, ...]) -> str:
         return "[" + ", ".join(f"{value:.7g}" for value in values) + "]"
 
     def text(value: str) -> str:
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        # A JSON string is a TOML string, line breaks and all.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
-    lines = [f"# {cell.remark}", f"name = {text(cell.name)}", f"remark = {text(cell.remark)}"]
+    def comment(value: str) -> str:
+        return "# " + "".join(letter if letter.isprintable() else " " for letter in value)
+
+    lines = [*map(comment, (cell.remark, *notes)), f"name = {text(cell.name)}", f"remark = {text(cell.remark)}"]
     lines += [
         f"{key} = {getattr(cell, key):.7g}"
         for key in ("capacity_Ah", "coulombic_efficiency", "current_max_A", "voltage_min_V", "voltage_max_V")

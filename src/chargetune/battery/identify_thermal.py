@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import nnls
 
 from chargetune.battery.cell import Cell
-from chargetune.battery.cyclers import Record
+from chargetune.battery.record import Record
 from chargetune.battery.thermal import GAS_CONSTANT, Thermal
 
 __all__ = ["activation_energy", "with_thermal"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chargetune.battery.baselines import Stepped
-from chargetune.battery.cyclers import Record
+from chargetune.battery.record import Record
 from chargetune.plants.plant import PlantError
 
 __all__ = ["pulse_test", "record_csv"]

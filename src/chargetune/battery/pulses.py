@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.cyclers import Record
+from chargetune.battery.record import Record
 
-__all__ = ["PulseSet", "find_pulse_sets", "segments"]
+__all__ = ["PULSE_MAX_S", "REST_MIN_S", "PulseSet", "find_pulse_sets", "groups", "segments"]
 
 # A rest at least this long leaves the cell relaxed, s.
 REST_MIN_S = 600.0
@@ -18,6 +18,8 @@ REST_MIN_S = 600.0
 PULSE_MAX_S = 120.0
 # Rests between pulses belong to the set up to this length, s.
 PAUSE_MAX_S = 300.0
+# Sets within this SOC of each other are at one SOC, as where pulses of several currents follow each other.
+SAME_SOC = 0.02
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,15 @@ def find_pulse_sets(record: Record) -> list[PulseSet]:
         if end > last:
             sets.append(PulseSet(last - 1, end))
     return sets
+
+
+def groups(soc: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """Indices of the values, which must not fall, in groups whose values lie within 0.02 of the group's first."""
+    starts = [0]
+    for i, z in enumerate(soc):
+        if z > soc[starts[-1]] + SAME_SOC:
+            starts.append(i)
+    return np.split(np.arange(len(soc)), starts[1:])
 
 
 def _seconds(record: Record, first: int, last: int) -> float:

@@ -116,7 +116,9 @@ def identify(
     capacity: Annotated[
         float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
     ] = None,
-    ocv: Annotated[Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from.")] = None,
+    ocv: Annotated[
+        Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from; surer near full and empty.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
     check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -11,9 +12,10 @@ import numpy as np
 from rich.table import Table
 
 from chargetune.battery.cell import load_cell
-from chargetune.battery.cyclers import Record, read_record
+from chargetune.battery.cyclers import read_record
 from chargetune.battery.identify import Identification, cell_toml, identify, predicted_voltage
 from chargetune.battery.pulses import segments
+from chargetune.battery.record import Record
 from chargetune.cli.output import console
 from chargetune.report.style import check_format
 
@@ -36,9 +38,13 @@ def identify_command(
     if figure is not None:
         check_format(figure)
     slow = None if ocv is None else read_record(ocv)
+    known = [read_record(path) for path in check]
     found = identify(read_record(data), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
+    checks = [(record.source, *_check(found, record)) for record in known]
+    today = datetime.now().astimezone().date().isoformat()
+    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(cell_toml(found.cell), encoding="utf-8")
+    out.write_text(cell_toml(found.cell, found.remarks), encoding="utf-8")
     # What was written is what a controller will read.
     cell = load_cell(out)
     if figure is not None:
@@ -46,7 +52,6 @@ def identify_command(
         from chargetune.report.style import save
 
         save(identification_figure(replace(found, cell=cell)), figure)
-    checks = [(path.name, *_check(found, read_record(path))) for path in check]
     if as_json:
         document: dict[str, Any] = {
             "points": [{"soc": fit.soc, "rms_mV": 1e3 * fit.rms_V, "values": fit.values, "sd": fit.sd} for fit in found.fits],
@@ -59,10 +64,11 @@ def identify_command(
     screen = console()
     screen.print(_table(found))
     for remark in found.remarks:
-        screen.print(f"[dim]{remark}[/]")
+        screen.print(remark, style="dim", markup=False, soft_wrap=True)
     for file, rate, rms, worst in checks:
-        screen.print(f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst")
-    screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""))
+        line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
+        screen.print(line, markup=False, soft_wrap=True)
+    screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
 
 
 def _check(found: Identification, record: Record) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from chargetune.battery.identify import Identification
 from chargetune.report.style import BLUE, GREEN, ORANGE, PAGE_IN, cell_note, journal_style, letter, new_figure
@@ -23,7 +24,7 @@ def identification_figure(found: Identification) -> Figure:
         pulses, rms, ocv, resistance = axes
         for k, fit in enumerate(found.fits):
             level = 1e3 * fit.measured_V[0]
-            pulses.plot(fit.time_s, 1e3 * fit.measured_V - level, color=BLUE, linewidth=0.8, label="measured" if k == 0 else None)
+            pulses.plot(fit.time_s, 1e3 * fit.measured_V - level, color=BLUE, linewidth=2.0, label="measured" if k == 0 else None)
             pulses.plot(fit.time_s, 1e3 * fit.fitted_V - level, color=ORANGE, linewidth=0.8, label="fitted" if k == 0 else None)
         pulses.set_xlabel("time in the set (s)")
         pulses.set_ylabel("voltage from rest (mV)")
@@ -31,8 +32,9 @@ def identification_figure(found: Identification) -> Figure:
         soc = [100 * fit.soc for fit in found.fits]
         rms.bar(soc, [1e3 * fit.rms_V for fit in found.fits], width=5.0, color=BLUE)
         rms.set_ylabel("rms of the fit (mV)")
-        z = np.array(cell.ocv_soc)
-        ocv.plot(100 * z, cell.ocv_V, "-", color=BLUE, marker=".", markersize=4)
+        between = np.linspace(0.0, 1.0, 201)
+        ocv.plot(100 * between, PchipInterpolator(cell.ocv_soc, cell.ocv_V)(between), color=BLUE)
+        ocv.plot(100 * np.array(cell.ocv_soc), cell.ocv_V, ".", color=BLUE, markersize=4)
         ocv.set_ylabel("OCV (V)")
         for name, color in zip(("R0_ohm", *(f"R{k}_ohm" for k in cell.pairs)), (BLUE, ORANGE, GREEN), strict=False):
             values = [1e3 * fit.values[name] for fit in found.fits]
