@@ -52,12 +52,26 @@ def tune(
     store: Annotated[Path | None, typer.Option(help="Where trials are kept; by default OUT/study.sqlite or CONFIG's name.")] = None,
     workers: Workers = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
     from chargetune.cli.tune import tune_command
 
-    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, as_json=as_json)
+    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, force=force, as_json=as_json)
+
+
+@app.command()
+def check(
+    config: ConfigFile,
+    safe: Annotated[str | None, typer.Option(help="A theta declared safe, as for simulate --theta; it has to keep every limit.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for a figure of each finding.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find errors of a formulation before anything is tuned; exit code 1 when there are any."""
+    from chargetune.cli.check import check_command
+
+    check_command(config, safe=safe, figures=figures, as_json=as_json)
 
 
 @app.command()
