@@ -12,7 +12,9 @@ from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.ecm import ecm_model
 from chargetune.control.finding import Evidence, Finding
 from chargetune.episode.episode import Ending, Episode
-from chargetune.episode.formulation import check_formulation, check_response, check_theta
+from chargetune.episode.formulation import check_formulation
+from chargetune.episode.influence import check_theta
+from chargetune.episode.response import check_response
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
@@ -37,19 +39,19 @@ def stand_in(problem: ChargingProblem) -> ChargingProblem:
     """
     if problem.plant_model is None:
         return replace(problem, sensors=Sensors(), verdict_samples=1)
-    absent = [
-        *(["anode_min_V"] if problem.plant_cell.anode is None else []),
-        *(["temperature_max_K"] if problem.plant_cell.thermal is None else []),
-    ]
-    kept = {label: tuple(n for n in getattr(problem, label) if n not in absent) for label in ("hard", "scored_only")}
+    cell = problem.plant_cell
+    anode = problem.anode_min_V if cell.anode else None
+    warm = problem.temperature_max_K if cell.thermal else None
+    absent = {name for name, known in (("anode_min_V", cell.anode), ("temperature_max_K", cell.thermal)) if known is None}
     return replace(
         problem,
         plant_model=None,
         sensors=Sensors(),
         verdict_samples=1,
-        hard=kept["hard"],
-        scored_only=kept["scored_only"],
-        **dict.fromkeys(absent),
+        anode_min_V=anode,
+        temperature_max_K=warm,
+        hard=tuple(name for name in problem.hard if name not in absent),
+        scored_only=tuple(name for name in problem.scored_only if name not in absent),
     )
 
 
@@ -114,7 +116,7 @@ def _target(problem: ChargingProblem) -> list[Finding]:
         needed = (target - problem.soc_start) * cell.capacity_Ah / cell.coulombic_efficiency / (problem.current_max_A or np.inf) * 3600
         remedy = f"at least {int(np.ceil(needed / problem.sampling_time_s))} steps, or soc_target of at most {most:.3f}"
     elif not reached >= target - MISSED_SOC:
-        message = f"soc_target = {target:g} is not reached in {60 * hours:.3g} min even by a controller that knows the cell: it ends at {reached:.3f}"
+        message = f"soc_target = {target:g}: a controller that knows the cell only gets to {reached:.3f} in {60 * hours:.3g} min"
         remedy = "more steps, a lower soc_target, or wider limits"
     else:
         return []
@@ -146,8 +148,8 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
                     "no-influence",
                     "warning",
                     f"{ratio.name} has next to no influence: the overpotential is measured at every step, which replaces what {ratio.of} "
-                    f"predicts; over its whole range the worst voltage moves by {ranges['exact']:.0f} mV (by {ranges['model']:.0f} mV if the "
-                    "model propagated it)",
+                    f"predicts; over its whole range the worst voltage moves by {ranges['exact']:.0f} mV (by "
+                    f"{ranges['model']:.0f} mV if the model propagated it)",
                     'overpotential = "model" (an overpotential cannot be measured on a real cell), or tune R0 or a backoff instead',
                     {"range_measured_mV": ranges["exact"], "range_propagated_mV": ranges["model"]},
                     Evidence(f"factor on {ratio.of}", "worst voltage over the limit (mV)", curves, {"limit": 0.0}),

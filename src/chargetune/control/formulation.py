@@ -103,9 +103,8 @@ def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple
     start = np.array(controller.start)
     q = problem.prepare(values, controller.setpoint, controller.model.nominal)
     lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(start, q))
-    choices = np.array(
-        list(itertools.product(*({low, high, float(np.clip(0.0, low, high))} for low, high in zip(lower, upper, strict=True))))
-    )
+    each = [sorted({low, high, float(np.clip(0.0, low, high))}) for low, high in zip(lower, upper, strict=True)]
+    choices = np.array(list(itertools.product(*each)))
     out = []
     for j, limit in enumerate(controller.limits):
         if limit.at == "terminal":
@@ -140,9 +139,8 @@ def check_horizon(
     transition = ca.Function("A", [x, u, p], [ca.jacobian(model.f(x, u, p), x)])
     step, points, fastest = model.sampling_time_s, _points(len(inputs)), []
     for k in points:
-        sizes = np.abs(
-            np.log(np.maximum(np.linalg.eigvals(_finite(transition(states[k], inputs[k], model.nominal))).astype(complex), 1e-12))
-        )
+        eigenvalues = np.linalg.eigvals(_finite(transition(states[k], inputs[k], model.nominal))).astype(complex)
+        sizes = np.abs(np.log(np.where(eigenvalues == 0, 1e-12, eigenvalues)))
         slow = sizes[(sizes > INTEGRATES) & (sizes < OVER)]
         fastest.append(step / np.max(slow) if slow.size else np.nan)
     constants = np.array(fastest)
@@ -175,4 +173,4 @@ def _points(count: int) -> NDArray[np.int64]:
 
 
 def _finite(matrix: Any) -> NDArray[np.float64]:
-    return np.nan_to_num(np.array(matrix, dtype=float))
+    return np.asarray(np.nan_to_num(np.array(matrix, dtype=float)), dtype=np.float64)

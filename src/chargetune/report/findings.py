@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chargetune.control.finding import Finding
-from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, journal_style, legend_above, new_figure, save
+from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, cell_note, journal_style, legend_above, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,12 +17,12 @@ __all__ = ["finding_figure", "save_findings"]
 
 
 def finding_figure(finding: Finding) -> Figure:
-    """The curves of a finding with its bounds, and its message above. Raises ValueError when it has none."""
+    """The curves of a finding with its bounds, and its message below. Raises ValueError when it has none."""
     shown = finding.evidence
     if shown is None:
         raise ValueError(f"finding {finding.code} has no curves to draw")
     with journal_style():
-        figure, (axis,) = new_figure(COLUMN_IN, 2.9)
+        figure, (axis,) = new_figure(COLUMN_IN, 3.0)
         handles = []
         for (label, (x, y)), color in zip(shown.lines.items(), (BLUE, ORANGE, GREEN), strict=False):
             handles += axis.plot(x, y, color=color, label=label, marker="o" if len(x) <= 60 else None, markersize=2.5)
@@ -31,9 +30,8 @@ def finding_figure(finding: Finding) -> Figure:
             handles.append(axis.axhline(value, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, label=label))
         axis.set_xlabel(shown.x_label)
         axis.set_ylabel(shown.y_label)
-        title = figure.suptitle(textwrap.fill(f"{finding.code}: {finding.message}", 72), fontsize=6.5, x=0.01, ha="left")
-        title.set_parse_math(False)
         legend_above(figure, handles, columns=3)
+        cell_note(figure, finding.code, finding.message)
     return figure
 
 
