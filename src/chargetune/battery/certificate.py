@@ -54,7 +54,12 @@ def run_charges(
     episodes: int,
     executor: Executor | None = None,
 ) -> Iterator[list[Charge]]:
-    """The fresh episodes in portions, as they are done; their draws depend on seed and index alone."""
+    """The fresh episodes in portions, as they are done; their draws depend on seed and index alone.
+
+    Raises ValueError when nothing is drawn that could differ, so that the episodes were all the same.
+    """
+    if not any(asdict(spread).values()) and not any(problem.sensors.noise_sd.values()):
+        raise ValueError("spread: everything is 0 and the sensors have no noise, so all episodes are the same; allowed is some spread")
     parts = [range(first, min(first + CHUNK, episodes)) for first in range(0, episodes, CHUNK)]
     if executor is None:
         for part in parts:

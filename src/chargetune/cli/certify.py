@@ -95,7 +95,8 @@ def _print(certificate: dict[str, Any]) -> None:
     screen = console()
     screen.print(
         f"[bold]{certificate['cell']['name']}[/], study {origin['study']!r}, trial {origin['trial']}: "
-        f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)"
+        f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
+        soft_wrap=True,
     )
     if certificate["cell"]["remark"]:
         screen.print(f"[dim]{certificate['cell']['remark']}[/]")
@@ -119,4 +120,5 @@ def _print(certificate: dict[str, Any]) -> None:
             f"{label} {number(f[f'{name}.{key}'])}" for label, key in (("median", "q50"), ("95 %", "q95"), ("worst", "worst"))
         )
         screen.print(f"{name.removesuffix('_min')} in minutes: {values}")
-    screen.print(f"[dim]{certificate['meaning']} Spread: {certificate['spread']}[/]")
+    spread = ", ".join(f"{name} {value:g}" for name, value in certificate["spread"].items())
+    screen.print(f"[dim]{certificate['meaning']} Spread: {spread}.[/]", soft_wrap=True)

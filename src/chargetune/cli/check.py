@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from chargetune.battery.charging_check import check_charging
 from chargetune.battery.config import load_config
-from chargetune.battery.formulation import check_charging
 from chargetune.cli.output import console
 from chargetune.control.finding import Finding
 

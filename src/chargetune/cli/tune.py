@@ -10,8 +10,8 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging_check import check_charging
 from chargetune.battery.config import Config, load_config
-from chargetune.battery.formulation import check_charging
 from chargetune.battery.reproduce import open_study, tuned_trial
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, theta_lines

@@ -31,8 +31,11 @@ def model_at(controller: Controller, theta: ArrayLike | None = None) -> Model:
     """The controller's model with the parameters it has at theta (None: untuned)."""
     model = controller.model
     values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal)).ravel()
-    edges = np.cumsum(list(model.parameter_blocks.values()))[:-1]
-    return model.with_parameters(**dict(zip(model.parameter_blocks, np.split(values, edges), strict=True)))
+    named, first = {}, 0
+    for name, size in model.parameter_blocks.items():
+        named[name] = values[first : first + size]
+        first += size
+    return model.with_parameters(**named)
 
 
 def row_values(

@@ -12,8 +12,8 @@ from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.ecm import ecm_model
 from chargetune.control.finding import Evidence, Finding
 from chargetune.episode.episode import Ending, Episode
-from chargetune.episode.formulation import check_formulation
 from chargetune.episode.influence import check_theta
+from chargetune.episode.perfect_model import check_formulation
 from chargetune.episode.response import check_response
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.sensors import Sensors
@@ -75,6 +75,8 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
             quick=quick,
         )
     )
+    if any(finding.code == "unsafe-start" for finding in found):
+        return tuple(found)
     found += _target(circuit)
     if circuit.space.dimension:
         weak = _measured_overpotential(circuit)

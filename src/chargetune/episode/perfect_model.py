@@ -42,21 +42,22 @@ def check_formulation(
     finer: Model | None = None,
     quick: bool = False,
 ) -> tuple[Finding, ...]:
-    """All checks of a controller that need no verdict on an episode.
+    """All checks of a controller that need no verdict on an episode; an unsafe start is told alone.
 
     ``plant`` is what the influence of theta is looked for on, by default a perfect model of the untuned controller.
     ``signs``: see `check_signs`; ``finer`` is the model with a shorter sampling time, for limits between samples.
     ``quick`` leaves out what builds other solvers when nothing is suspicious: longer horizons.
     """
+    found = list(check_start(controller))
+    if found:
+        # From there every closed loop breaks the limit, whatever else is right or wrong.
+        return tuple(found)
     perfect = perfect_plant(controller)
     run = simulate(controller, perfect, steps=steps)
-    states = run.state if run.state is not None else np.zeros((1, len(perfect.model.states)))
-    found = [*check_start(controller)]
-    if len(run):
-        found += check_signs(controller, signs or {}, states, run.input)
-        found += check_horizon(controller, states, run.input)
-        if not found or all(f.code != "unsafe-start" for f in found):
-            found += check_limits(controller, run, finer=finer)
+    if run.state is not None and len(run):
+        found += check_signs(controller, signs or {}, run.state, run.input)
+        found += check_horizon(controller, run.state, run.input)
+        found += check_limits(controller, run, finer=finer)
         if not quick and all(f.code != "short-horizon" for f in found):
             found += check_longer_horizon(controller, run)
     if controller.theta.dimension:
