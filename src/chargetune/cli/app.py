@@ -53,12 +53,26 @@ def tune(
     store: Annotated[Path | None, typer.Option(help="Where trials are kept; by default OUT/study.sqlite or CONFIG's name.")] = None,
     workers: Workers = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
     from chargetune.cli.tune import tune_command
 
-    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, as_json=as_json)
+    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, force=force, as_json=as_json)
+
+
+@app.command()
+def check(
+    config: ConfigFile,
+    safe: Annotated[str | None, typer.Option(help="A theta declared safe, as for simulate --theta; it has to keep every limit.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for a figure of each finding.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find errors of a formulation before anything is tuned; exit code 1 when there are any."""
+    from chargetune.cli.check import check_command
+
+    check_command(config, safe=safe, figures=figures, as_json=as_json)
 
 
 @app.command()
@@ -144,6 +158,53 @@ def compare(
     from chargetune.cli.compare import compare_command
 
     compare_command(config, store=store, study=study, seed=seed, workers=workers, figure=figure, as_json=as_json)
+
+
+@app.command()
+def certify(
+    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    study: Annotated[str | None, typer.Option(help="Name of the study; needed when the store holds several.")] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 0,
+    confidence: Annotated[float, typer.Option(help="Confidence of the bound on the violation probability.")] = 0.95,
+    soc_start: Annotated[float, typer.Option(help="SOC at the start varies by +- this.")] = 0.03,
+    resistance: Annotated[float, typer.Option(help="R0, R1, .. of the plant vary by +- this share.")] = 0.05,
+    capacitance: Annotated[float, typer.Option(help="C1, .. of the plant vary by +- this share.")] = 0.05,
+    capacity: Annotated[float, typer.Option(help="The plant's capacity varies by +- this share.")] = 0.02,
+    fade: Annotated[float, typer.Option(help="Share of the capacity that is lost at full age.")] = 0.05,
+    growth: Annotated[float, typer.Option(help="Share by which resistances have grown at full age.")] = 0.10,
+    workers: Workers = 1,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Certificate to write (.json); traces and figure go beside it.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run the tuned controller on fresh episodes with other plants and bound the probability of a violation."""
+    from chargetune.battery.spread import Spread
+    from chargetune.cli.certify import certify_command
+
+    certify_command(
+        store,
+        study=study,
+        episodes=episodes,
+        seed=seed,
+        confidence=confidence,
+        spread=Spread(soc_start, resistance, capacitance, capacity, fade, growth),
+        workers=workers,
+        output=output,
+        as_json=as_json,
+    )
+
+
+@app.command()
+def verify(
+    certificate: Annotated[Path, typer.Argument(help="Certificate (JSON); its traces lie beside it.", show_default=False)],
+    as_json: AsJson = False,
+) -> None:
+    """Recompute every figure of a certificate from its traces; exit code 1 and the names when some differ."""
+    from chargetune.cli.verify import verify_command
+
+    verify_command(certificate, as_json=as_json)
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value

@@ -13,14 +13,14 @@ from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import load_config
 from chargetune.cli.output import console, metrics_table
 
-__all__ = ["simulate_command"]
+__all__ = ["parse_theta", "simulate_command"]
 
 
 def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool) -> None:
     """Run one closed loop and print what it was worth; with ``as_json`` also the trajectory."""
     config = load_config(path)
     problem = config.problem(path.parent)
-    values = config.values(problem) if theta is None else _parse(theta, problem)
+    values = config.values(problem) if theta is None else parse_theta(theta, problem, "--theta")
     episode = problem.episode(values, seed)
     if not len(episode):
         raise ValueError(f"the episode has no interval; it ended with {episode.ending.value}: {episode.message}")
@@ -59,15 +59,16 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
     out.print(metrics_table({"this run": score}, problem))
 
 
-def _parse(text: str, problem: ChargingProblem) -> NDArray[np.float64]:
+def parse_theta(text: str, problem: ChargingProblem, option: str) -> NDArray[np.float64]:
+    """theta as an option gives it: numbers separated by commas, or a JSON object of named values. Raises ValueError."""
     if text.lstrip().startswith("{"):
         try:
             named = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ValueError(f"--theta is not valid JSON: {error}") from error
+            raise ValueError(f"{option} is not valid JSON: {error}") from error
         return problem.space.from_dict(named)
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise ValueError(f"--theta = {text!r}: expected numbers separated by commas, or a JSON object of named values") from error
+        raise ValueError(f"{option} = {text!r}: expected numbers separated by commas, or a JSON object of named values") from error
     return problem.space.validate(numbers)

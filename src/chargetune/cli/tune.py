@@ -10,8 +10,10 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging_check import check_charging
 from chargetune.battery.config import Config, load_config
 from chargetune.battery.reproduce import open_study, tuned_trial
+from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, theta_lines
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
@@ -34,9 +36,17 @@ def bar(*, quiet: bool) -> Progress:
 
 
 def tune_command(
-    path: Path, *, trials: int | None, seed: int | None, store: Path | None, workers: int, out: Path | None, as_json: bool
+    path: Path,
+    *,
+    trials: int | None,
+    seed: int | None,
+    store: Path | None,
+    workers: int,
+    out: Path | None,
+    as_json: bool,
+    force: bool = False,
 ) -> None:
-    """Tune, show the way there, and say what came of it."""
+    """Tune, show the way there, and say what came of it. An error of the formulation stops before the first trial, unless ``force``."""
     config = load_config(path)
     if seed is not None:
         config = config.model_copy(update={"study": config.study.model_copy(update={"seed": seed})})
@@ -47,6 +57,7 @@ def tune_command(
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
+    _check(problem, force=force)
 
     with ExitStack() as stack:
         opened = stack.enter_context(Store(kept))
@@ -82,6 +93,13 @@ def tune_command(
         return
     _closing(problem, everything, best)
     console().print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+
+
+def _check(problem: ChargingProblem, *, force: bool) -> None:
+    findings = check_charging(problem, quick=True)
+    print_findings(findings, console(stderr=True))
+    if not force and any(finding.severity == "error" for finding in findings):
+        raise ValueError("the formulation has an error; `chargetune check` shows it, --force tunes nevertheless")
 
 
 def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | None) -> None:

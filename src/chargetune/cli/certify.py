@@ -1,0 +1,124 @@
+"""chargetune certify."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from chargetune.battery.certificate import Charge, run_charges, write_certificate
+from chargetune.battery.config import problem_of_document
+from chargetune.battery.spread import Spread
+from chargetune.cli.output import console, number
+from chargetune.cli.tune import bar
+from chargetune.study.executors import process_executor
+from chargetune.study.store import Store
+from chargetune.study.trial import best_feasible
+
+__all__ = ["certify_command"]
+
+
+def certify_command(
+    path: Path,
+    *,
+    study: str | None,
+    episodes: int,
+    seed: int,
+    confidence: float,
+    spread: Spread,
+    workers: int,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Run the best feasible theta of a study on fresh episodes and write the certificate."""
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
+    with Store(path, read_only=True) as store:
+        names = [record.name for record in store.studies()]
+        if study is None and len(names) != 1:
+            raise ValueError(f"{path} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
+        record = store.study(study or names[0])
+        trials = store.trials(record.id)
+    best = best_feasible(trials)
+    if best is None:
+        raise ValueError(f"{path}: study {record.name!r} has no trial that kept every limit, so there is nothing to certify")
+    if "cell" not in record.identity["config"]:
+        raise ValueError(f"{path}: study {record.name!r} is not one of battery charging")
+    problem = problem_of_document(record.identity["config"])
+    target = output or path.with_name(f"{path.stem}-certificate.json")
+    if target.suffix != ".json":
+        raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    charges: list[Charge] = []
+    with ExitStack() as stack:
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
+        progress = stack.enter_context(bar(quiet=as_json))
+        task = progress.add_task("certifying", total=episodes, note="")
+        for portion in run_charges(problem, best.theta, spread=spread, seed=seed, episodes=episodes, executor=executor):
+            charges += portion
+            violating = sum(charge.score is None or not charge.score.feasible for charge in charges)
+            progress.update(task, advance=len(portion), note=f"{violating} violating")
+    certificate = write_certificate(
+        target,
+        problem,
+        charges,
+        theta=dict(zip(problem.space.entries, best.theta, strict=True)),
+        origin={
+            "store": path.name,
+            "study": record.name,
+            "study_sha256": record.identity_sha256,
+            "trial": best.number,
+            "trials": len(trials),
+        },
+        spread=spread,
+        seed=seed,
+        confidence=confidence,
+    )
+    from chargetune.report.certificate import certificate_figure
+    from chargetune.report.style import save
+
+    figure = save(certificate_figure(target), target.with_suffix(".png"))
+    if as_json:
+        print(json.dumps(certificate))  # noqa: T201
+        return
+    screen = console()
+    _print(certificate)
+    screen.print(f"certificate {target}\ntraces {target.with_suffix('.npz')}\nfigure {figure}", soft_wrap=True)
+    screen.print(f"[dim]recompute every figure from the traces: chargetune verify {target}[/]", soft_wrap=True)
+
+
+def _print(certificate: dict[str, Any]) -> None:
+    f, origin = certificate["figures"], certificate["origin"]
+    screen = console()
+    screen.print(
+        f"[bold]{certificate['cell']['name']}[/], study {origin['study']!r}, trial {origin['trial']}: "
+        f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
+        soft_wrap=True,
+    )
+    if certificate["cell"]["remark"]:
+        screen.print(f"[dim]{certificate['cell']['remark']}[/]")
+    bound, confidence = f["violation_probability_upper"], certificate["confidence"]
+    screen.print(f"probability of a violation at most {100 * bound:.2f} % (confidence {100 * confidence:g} %)")
+    table = Table(box=None, pad_edge=False)
+    for heading in ("limit", "violations", "worst excess", "tolerance"):
+        table.add_column(heading, justify="left" if heading == "limit" else "right")
+    for limit in certificate["limits"]:
+        worst, unit = f[f"{limit['name']}.worst_excess"], limit["name"].rpartition("_")[2]
+        factor, shown = (1e3, "mV") if unit == "V" else (1.0, unit)
+        table.add_row(
+            limit["name"],
+            str(f[f"{limit['name']}.violations"]),
+            f"{number(None if worst is None else factor * worst)} {shown}",
+            f"{factor * limit['tolerance']:g} {shown}",
+        )
+    screen.print(table)
+    for name in ("t80_min", "t95_min"):
+        values = ", ".join(
+            f"{label} {number(f[f'{name}.{key}'])}" for label, key in (("median", "q50"), ("95 %", "q95"), ("worst", "worst"))
+        )
+        screen.print(f"{name.removesuffix('_min')} in minutes: {values}")
+    spread = ", ".join(f"{name} {value:g}" for name, value in certificate["spread"].items())
+    screen.print(f"[dim]{certificate['meaning']} Spread: {spread}.[/]", soft_wrap=True)

@@ -1,0 +1,73 @@
+"""chargetune check."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from chargetune.battery.charging_check import check_charging
+from chargetune.battery.config import load_config
+from chargetune.cli.output import console
+from chargetune.control.finding import Finding
+
+__all__ = ["check_command", "facts", "print_findings"]
+
+
+def check_command(path: Path, *, safe: str | None, figures: Path | None, as_json: bool) -> None:
+    """Check the formulation of a study file; exit code 1 when an error is found."""
+    from chargetune.cli.simulate import parse_theta
+
+    config = load_config(path)
+    problem = config.problem(path.parent)
+    start = None if safe is None else parse_theta(safe, problem, "--safe")
+    screen = console()
+    if as_json:
+        findings = check_charging(problem, start=start)
+    else:
+        with console(stderr=True).status("running closed loops"):
+            findings = check_charging(problem, start=start)
+    drawn: list[Path] = []
+    if figures is not None and findings:
+        from chargetune.report.findings import save_findings
+
+        drawn = save_findings(findings, figures)
+    if as_json:
+        print(json.dumps({"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}))  # noqa: T201
+    else:
+        print_findings(findings, screen)
+        screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), soft_wrap=True)
+    if any(f.severity == "error" for f in findings):
+        sys.exit(1)
+
+
+def print_findings(findings: Sequence[Finding], screen: Console) -> None:
+    """Each finding with what to do, two lines."""
+    for finding in findings:
+        color = "red" if finding.severity == "error" else "yellow"
+        screen.print(f"[{color}]{finding.severity}[/] [bold]{finding.code}[/]: ", end="")
+        # Names of entries have brackets, which are no markup.
+        screen.print(finding.message, markup=False, soft_wrap=True)
+        screen.print(f"  what to do: {finding.remedy}", markup=False, soft_wrap=True)
+
+
+def summary(findings: Sequence[Finding]) -> str:
+    """How many of each."""
+    errors = sum(f.severity == "error" for f in findings)
+    return f"{errors} errors, {len(findings) - errors} warnings" if findings else "nothing found"
+
+
+def facts(finding: Finding) -> dict[str, Any]:
+    """A finding as JSON, without its curves; a number that is none is null."""
+    numbers = {name: value if abs(value) < float("inf") else None for name, value in finding.numbers.items()}
+    return {
+        "code": finding.code,
+        "severity": finding.severity,
+        "message": finding.message,
+        "remedy": finding.remedy,
+        "numbers": numbers,
+    }
