@@ -163,7 +163,8 @@ class ChargingProblem:
             if unknown:
                 raise ValueError(f"{label} names {unknown}, allowed are the limits that are set: {', '.join(names)}")
         if self.plant_model is None:
-            missing = [limit.name for limit in self.limits if limit.signal not in ecm_model(self.plant_cell).output_names]
+            known = {"voltage": True, "temperature": self.plant_cell.thermal is not None, "anode": self.plant_cell.anode is not None}
+            missing = [limit.name for limit in self.limits if not known[limit.of]]
             if missing:
                 raise ValueError(f"{missing} cannot be measured on this cell: it has no [thermal] or [anode] table")
 

@@ -23,6 +23,7 @@ def verify_command(path: Path, *, as_json: bool) -> None:
         screen = Console(highlight=False)
         for d in differences:
             screen.print(f"{d.name}: stated {d.stated}, recomputed {d.recomputed}", style="red", markup=False, soft_wrap=True)
-        screen.print(f"{path}: {len(differences)} figures differ" if differences else f"{path}: every figure is what the traces give")
+        verdict = f"{len(differences)} figures differ" if differences else "every figure is what the traces give"
+        screen.print(f"{path}: {verdict}", markup=False, soft_wrap=True)
     if differences:
         sys.exit(1)
