@@ -138,7 +138,17 @@ def test_the_drawn_plant_differs_and_the_controller_does_not_know():
 def test_an_electrochemical_plant_is_varied_and_another_is_refused():
     with pytest.raises(ValueError, match="allowed are the cell's circuit and an electrochemical model"):
         Variations(forced(plant_model=object()))
-    Variations(forced(plant_model=Electrochemical()))
+    # A single particle that is charged for half a minute.
+    problem = forced(plant_model=Electrochemical("SPM"), steps=3, current_min_A=0.0, kalman=None)
+    one = Spread().draw(problem, 0, 0)
+    plain, smaller, harder = (
+        Variations(problem).run(replace(one, soc_start=0.5, factors={**dict.fromkeys(one.factors, 1.0), **factors}), THETA)[1]
+        for factors in ({}, {"capacity_Ah": 0.8}, {"R0_ohm": 1.5})
+    )
+    current = np.array([episode.input[0, 0] for episode in (plain, smaller, harder)])
+    gained = np.array([episode.signal("soc")[1][0] - 0.5 for episode in (plain, smaller, harder)]) / current
+    assert gained[1] / gained[0] == pytest.approx(1 / 0.8, rel=1e-3)
+    assert harder.signal("voltage_V")[0][0] > plain.signal("voltage_V")[0][0] + 0.005
 
 
 def test_nothing_to_draw_is_refused():

@@ -1,5 +1,6 @@
 """The formulation check of charging problems: one test for each planted error, silence on every example."""
 
+import runpy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.thermal import Thermal
 from chargetune.battery.theta import CurrentLimit
+from chargetune.episode.perfect_model import check_formulation
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
@@ -40,6 +42,13 @@ def test_there_are_examples():
 def test_nothing_is_found_in_an_example(path):
     found = load_config(path).problem(path.parent)
     assert check_charging(found, quick=found.plant_model is not None) == ()
+
+
+def test_nothing_is_found_in_the_example_that_is_no_battery():
+    example = runpy.run_path(str(EXAMPLES / "custom_system.py"))
+    plant = SimulatedPlant(example["crane"](1.0), {})
+    signs = {("position", "acceleration"): 1}
+    assert check_formulation(example["CONTROLLER"], steps=example["STEPS"], plant=plant, signs=signs, quick=True) == ()
 
 
 @pytest.mark.parametrize("seed", range(4))
