@@ -60,6 +60,15 @@ def test_a_hard_limit_goes_before_a_soft_one_where_both_cannot_be_kept():
     assert hard.excess["voltage_max_V"] <= both.excess["voltage_max_V"] + 1e-6
 
 
+@pytest.mark.parametrize("horizon", [1, 5])
+def test_a_limit_that_cannot_be_kept_is_no_failure_of_the_solver(horizon):
+    """A least current of 4 A at 60 % SOC is beyond 4.2 V: it is what is applied, and it is optimal."""
+    _, episode = scored(CELL, soc_start=0.6, soc_target=0.9, steps=6, current_min_A=4.0, horizon=horizon)
+    assert episode.failures == 0
+    assert episode.iterations.max() <= 3
+    np.testing.assert_allclose(episode.input[3:], 4.0, atol=1e-6)
+
+
 def test_current_limit_holds_what_the_model_does_not_see():
     blind = {"temperature_max_K": HOT, "scored_only": ("temperature_max_K",), "current_limit": CurrentLimit(nodes=3, lower=0.1)}
     loose, _ = scored(**blind)

@@ -354,7 +354,7 @@ def _residual(controller: Controller, stage: _Linearisation, final: _Linearisati
 
     stationarity      clip(-range gamma (g + A' lambda), (lower - U) / range, (upper - U) / range) is zero
     complementarity   min(lambda_i, s_j - c_i) is zero with s_j = max(0, max c_i): an unused row has no multiplier
-    exactness         min(s_j, w_j (1 + s_j) - sum lambda) is zero: a violation only where the penalty is spent
+    exactness         min(s_j, 1 + s_j - sum lambda / w_j) is zero: a violation only where the penalty is spent
     """
     horizon, nu = controller.horizon, len(controller.model.inputs)
     size = horizon * nu
@@ -376,8 +376,9 @@ def _residual(controller: Controller, stage: _Linearisation, final: _Linearisati
     for j, (limit, s) in enumerate(zip(controller.limits, _violations(controller, groups, rows), strict=True)):
         own_rows = [i for i, group in enumerate(groups) if group == j]
         residuals += [ca.fabs(_least(multipliers[i], s - rows[i])) for i in own_rows]
-        total = sum((multipliers[i] for i in own_rows), ca.SX(0))
-        residuals.append(ca.fabs(_least(s, gamma * limit.scale * limit.penalty * (1 + s) - total)))
+        # Relative to the price, which is so large that its rounding alone would exceed the tolerance.
+        spent = sum((multipliers[i] for i in own_rows), ca.SX(0)) / (gamma * limit.scale * limit.penalty)
+        residuals.append(ca.fabs(_least(s, 1 + s - spent)))
     everything = ca.vertcat(*residuals)
     worst: Any = 0.0
     for k in range(everything.shape[0]):
