@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["convergence_figure", "incumbents", "loss", "worst_excess"]
+__all__ = ["convergence_figure", "excess_unit", "incumbents", "loss", "worst_excess"]
 
 
 def loss(view: StudyView, trial: Trial) -> float:
@@ -45,7 +45,7 @@ def convergence_figure(view: StudyView) -> Figure:
 
         figure, (upper, lower) = new_figure(COLUMN_IN, 3.6, 2, 1, sharex=True)
         numbers = [t.number for t in view.trials]
-        label, scale = _excess_unit(view)
+        label, scale = excess_unit(view)
         _scales(upper, lower, [loss(view, t) for t in view.trials])
         marks = _marks(view)
         for text, trials, style in marks:
@@ -110,7 +110,7 @@ def _loss_label(view: StudyView) -> str:
     return "−objective" if view.problem is None else "mean of $(z_d - z)^2$"
 
 
-def _excess_unit(view: StudyView) -> tuple[str, float]:
+def excess_unit(view: StudyView) -> tuple[str, float]:
     """Unit of the lower panel and the factor to it: millivolts when every limit is a voltage."""
     limits = {name for t in view.trials if t.score is not None for name in t.score.excess}
     if (limits or view.problem is not None) and all(name.endswith("_V") for name in limits):

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["backoff_figure", "backoff_values", "current_limit_figure", "resistance_figure", "resistance_values", "violated_soc"]
+__all__ = [
+    "SOC", "backoff_figure", "backoff_values", "current_limit_figure", "current_limit_values", "resistance_figure",
+    "resistance_values", "violated_soc",
+]  # fmt: skip
 
 SOC = np.linspace(0.0, 1.0, 201)
 
@@ -34,6 +37,14 @@ def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: Array
     nodes = table_nodes(own)
     spline = CubicSpline(nodes, np.interp(nodes, own, values), bc_type="natural")(soc)
     return np.asarray((spline + np.hypot(spline, FLOOR * values.mean())) / 2)
+
+
+def current_limit_values(problem: ChargingProblem, nodes: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
+    """The current limit in A with these node values, shares of the largest current: piecewise linear. Raises ValueError without one."""
+    if problem.current_limit is None:
+        raise ValueError("current_limit is not part of this problem's theta")
+    share = np.interp(soc, problem.current_limit.grid, np.asarray(nodes, dtype=float))
+    return np.asarray((problem.current_max_A or 0.0) * share, dtype=np.float64)
 
 
 def violated_soc(view: StudyView) -> list[tuple[float, float]]:
@@ -106,10 +117,10 @@ def current_limit_figure(view: StudyView) -> Figure:
     problem = view.problem
     if problem is None or problem.current_limit is None:
         raise ValueError(f"study {view.name!r} does not tune a current limit")
-    part, grid, largest = view.space.slices["current_limit"], problem.current_limit.grid, problem.current_max_A or 0.0
+    part, largest = view.space.slices["current_limit"], problem.current_max_A or 0.0
 
     def values(theta: Any) -> NDArray[np.float64]:
-        return np.asarray(largest * np.interp(SOC, grid, np.array(theta[part])), dtype=np.float64)
+        return current_limit_values(problem, np.array(theta[part]))
 
     with journal_style():
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,17 +15,18 @@ from chargetune.battery.reproduce import tuned_trial
 from chargetune.episode.episode import Episode
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import space_from_json
-from chargetune.study.store import Store
+from chargetune.study.store import Store, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["StudyView", "read_study"]
+__all__ = ["StudyView", "read_studies", "read_study"]
 
 
 @dataclass(frozen=True)
 class StudyView:
     """A study as it stood when it was read. ``problem`` is None when the study is not one of battery charging.
 
-    ``tuner`` is the tuner's name in the configuration, empty when that names none.
+    ``tuner`` is the tuner's name in the configuration, empty when that names none. ``record`` is what the store says of the
+    study as a whole, None only for trials that come from no store.
     """
 
     path: Path
@@ -34,6 +35,7 @@ class StudyView:
     space: ParameterSpace
     trials: tuple[Trial, ...]
     problem: ChargingProblem | None
+    record: StudyRecord | None = None
 
     @property
     def untuned(self) -> Trial | None:
@@ -88,15 +90,30 @@ def read_study(store_path: str | os.PathLike[str], name: str, *, trials: int | N
     path = Path(store_path)
     with Store(path, read_only=True) as store:
         record = store.study(name)
-        found = tuple(store.trials(record.id)[:trials])
+        found = store.trials(record.id)[:trials]
     if not found:
         raise ValueError(f"{path}: study {name!r} has no trials yet, so there is nothing to draw")
+    return _view(path, record, found)
+
+
+def read_studies(store_path: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
+    """Every study of a store, oldest first, also those without trials; ``only`` reads the one with this id, if there is one.
+
+    Raises StoreError for a file that is no store.
+    """
+    path = Path(store_path)
+    with Store(path, read_only=True) as store:
+        return [_view(path, r, store.trials(r.id)) for r in store.studies() if only is None or r.id == only]
+
+
+def _view(path: Path, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
     config = record.identity["config"]
     return StudyView(
         path=path,
-        name=name,
+        name=record.name,
         tuner=str(config.get("study", {}).get("tuner", "")),
         space=space_from_json(record.identity["space"]),
-        trials=found,
+        trials=tuple(trials),
         problem=problem_of_document(config) if "cell" in config else None,
+        record=record,
     )

@@ -1,0 +1,95 @@
+"""How much the result of a study depends on each entry of theta."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from chargetune.battery.charging import ChargingProblem
+from chargetune.report.convergence import worst_excess
+from chargetune.report.reading import StudyView
+from chargetune.study.trial import Trial
+
+__all__ = ["STEP", "Sensitivity", "again", "finite_differences", "rank_correlations"]
+
+# Share of an entry's range (logarithmic for a log scale) by which it is moved.
+STEP = 0.02
+LEAST_TRIALS = 8
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What moving one entry of theta by `STEP` of its range does, down and up; None where the bound is nearer or no score came.
+
+    ``minutes``: change of the time to 95 % SOC. ``objective``: change of the objective. ``excess``: change of the worst excess over
+    all limits, in their unit. Each is a pair (down, up).
+    """
+
+    entry: str
+    minutes: tuple[float | None, float | None]
+    objective: tuple[float | None, float | None]
+    excess: tuple[float | None, float | None]
+
+
+def again(problem: ChargingProblem, trial: Trial) -> float | None:
+    """The largest difference between the stored score and that of the same theta and seed now; None when either is missing.
+
+    Compared are objective and excesses. A difference above rounding says that the program or the machine is another.
+    """
+    score, _, _ = problem(np.array(trial.theta), trial.seed)
+    if score is None or trial.score is None:
+        return None
+    pairs = [(score.objective, trial.score.objective), *((score.excess[n], e) for n, e in trial.score.excess.items())]
+    return max(abs(a - b) for a, b in pairs)
+
+
+def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], None] = lambda: None) -> list[Sensitivity]:
+    """Two more episodes an entry on the simulated plant, with the seed of ``trial``: noise is the same in all of them.
+
+    Raises ValueError for a study that is not one of battery charging: its document does not say how to evaluate.
+    """
+    problem, space = view.problem, view.space
+    if problem is None:
+        raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
+    base, _, _ = problem(np.array(trial.theta), trial.seed)
+    centre, out = space.to_unit(np.array(trial.theta)), []
+    for i, entry in enumerate(space.entries):
+        changes = []
+        for step in (-STEP, STEP):
+            moved = centre.copy()
+            moved[i] += step
+            inside = -1e-12 <= moved[i] <= 1 + 1e-12
+            score = problem(space.from_unit(moved), trial.seed)[0] if inside else None
+            if score is None or base is None:
+                changes.append((None, None, None))
+            else:
+                after, before = score.metrics.get("t95_min"), base.metrics.get("t95_min")
+                minutes = None if after is None or before is None else after - before
+                excess = max(score.excess.values()) - max(base.excess.values())
+                changes.append((minutes, score.objective - base.objective, excess))
+            progress()
+        down, up = changes
+        out.append(Sensitivity(entry, (down[0], up[0]), (down[1], up[1]), (down[2], up[2])))
+    return out
+
+
+def rank_correlations(view: StudyView) -> dict[str, tuple[float, float]]:
+    """Spearman's rank correlation of each entry of theta with objective and worst excess over the scored trials.
+
+    Empty below 8 of them; an entry that was never moved is left out. A tuner does not sample evenly: near its end most trials lie
+    around the best one, so this shows a tendency and no effect.
+    """
+    scored = [t for t in view.trials if t.score is not None]
+    if len(scored) < LEAST_TRIALS:
+        return {}
+    thetas = np.array([t.theta for t in scored])
+    objective = np.array([t.score.objective for t in scored if t.score is not None])
+    excess = np.array([worst_excess(t) for t in scored])
+    out = {}
+    for i, entry in enumerate(view.space.entries):
+        if np.ptp(thetas[:, i]) and np.ptp(objective) and np.ptp(excess):
+            out[entry] = (float(spearmanr(thetas[:, i], objective).statistic), float(spearmanr(thetas[:, i], excess).statistic))
+    return out
