@@ -103,6 +103,36 @@ def show(
 
 
 @app.command()
+def report(
+    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    study: Annotated[str | None, typer.Option(help="Name of a study; may be left out where there is one.")] = None,
+    out: Annotated[Path | None, typer.Option("--output", "-o", help="Page to write; by default STORE's name with .html.")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for the figures as vector PDF, at the width of a journal.")] = None,
+    evaluate: Annotated[
+        bool, typer.Option(help="Evaluate the best theta and its neighbours on a simulated plant, for the sensitivities.")
+    ] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Write one study as a self-contained HTML page, which opens offline."""
+    from chargetune.cli.report import report_command
+
+    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, as_json=as_json)
+
+
+@app.command()
+def web(
+    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
+    host: Annotated[str, typer.Option(help="Address to listen on; any but loopback needs a token.")] = "127.0.0.1",
+    token: Annotated[str | None, typer.Option(envvar="CHARGETUNE_WEB_TOKEN", help="What a viewer must know.", show_default=False)] = None,
+) -> None:
+    """Show the studies of a store live in a browser, read-only."""
+    from chargetune.cli.web import web_command
+
+    web_command(store, port=port, host=host, token=token)
+
+
+@app.command()
 def reproduce(
     case: Annotated[CaseName, typer.Argument(help="What theta is: the backoff, the model's R1, or both.", show_default=False)],
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",

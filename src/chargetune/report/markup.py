@@ -25,7 +25,8 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str 
 
 def paragraph(text: str, kind: str = "") -> str:
     """A paragraph of plain text."""
-    return f"<p{f' class={kind!r}'.replace(chr(39), chr(34)) if kind else ''}>{escape(text)}</p>\n"
+    opened = f'<p class="{kind}">' if kind else "<p>"
+    return f"{opened}{escape(text)}</p>\n"
 
 
 def section(title: str, *parts: str) -> str:

@@ -11,10 +11,8 @@ from scipy.interpolate import CubicSpline
 from chargetune.battery.charging import ChargingProblem
 from chargetune.episode.episode import Episode
 from chargetune.report.learned import SOC, backoff_values, current_limit_values, resistance_values
-from chargetune.report.reading import StudyView
+from chargetune.report.reading import Reading, StudyView
 from chargetune.report.trajectories import LABELS, curves
-from chargetune.study.store import StoreError
-from chargetune.study.trial import Trial
 
 __all__ = ["POINTS", "profiles", "rounded", "signals", "thin", "trial_drawing"]
 
@@ -23,27 +21,13 @@ POINTS = 1500
 NEAR_V = (0.06, 0.08)
 
 
-def trial_drawing(view: StudyView, trial: Trial, points: int = POINTS) -> dict[str, Any]:
-    """``panels`` over time and ``profiles`` over SOC of one trial; ``message`` says why there is no curve.
-
-    A damaged trace is a message too: the other trials stay readable.
-    """
-    message, panels = "", []
-    try:
-        episode = view.episode(trial)
-        if episode is None:
-            message = "no trace is stored"
-        else:
-            panels = signals(view.problem, episode, points)
-    except StoreError as error:
-        message = str(error)
-    except (KeyError, TypeError, ValueError) as error:
-        # A program may store arrays of its own with a trial.
-        message = f"the stored trace is not that of an episode ({error})"
+def trial_drawing(view: StudyView, reading: Reading, points: int = POINTS) -> dict[str, Any]:
+    """``panels`` over time and ``profiles`` over SOC of one trial; ``message`` says why there is no curve."""
+    trial, episode = reading.trial, reading.episode
     return {
         "number": trial.number,
-        "message": message,
-        "panels": panels,
+        "message": reading.message,
+        "panels": [] if episode is None else signals(view.problem, episode, points),
         "profiles": profiles(view, np.array(trial.theta)),
         "theta": dict(zip(view.space.entries, trial.theta, strict=True)),
     }

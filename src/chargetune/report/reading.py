@@ -15,10 +15,19 @@ from chargetune.battery.reproduce import tuned_trial
 from chargetune.episode.episode import Episode
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import space_from_json
-from chargetune.study.store import Store, StudyRecord
+from chargetune.study.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["StudyView", "read_studies", "read_study"]
+__all__ = ["Reading", "StudyView", "read_studies", "read_study"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A trial and its stored episode; without an episode ``message`` says why."""
+
+    trial: Trial
+    episode: Episode | None
+    message: str
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,23 @@ class StudyView:
                 trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
                 if trace is not None:
                     yield trial, Episode.from_arrays(*trace)
+
+    def readings(self, trials: Iterable[Trial]) -> Iterator[Reading]:
+        """Each of ``trials`` with its episode or the reason why there is none; nothing is raised for a single trace."""
+        with Store(self.path, read_only=True) as store:
+            record = store.study(self.name)
+            for trial in trials:
+                try:
+                    trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
+                    if trace is None:
+                        yield Reading(trial, None, "no trace is stored")
+                    else:
+                        yield Reading(trial, Episode.from_arrays(*trace), "")
+                except StoreError as error:
+                    yield Reading(trial, None, str(error))
+                except (KeyError, TypeError, ValueError) as error:
+                    # A program may store arrays of its own with a trial.
+                    yield Reading(trial, None, f"the stored trace is not that of an episode ({error})")
 
     def episode(self, trial: Trial | None) -> Episode | None:
         """The episode of one trial; None without trial or trace."""

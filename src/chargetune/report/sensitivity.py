@@ -70,7 +70,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
                 minutes = None if after is None or before is None else after - before
                 excess = max(score.excess.values()) - max(base.excess.values())
                 changes.append((minutes, score.objective - base.objective, excess))
-            progress()
+        progress()
         down, up = changes
         out.append(Sensitivity(entry, (down[0], up[0]), (down[1], up[1]), (down[2], up[2])))
     return out

@@ -118,7 +118,7 @@ const Figures = (() => {
     const limits = [{ ...level(0), yref: "y2" }];
     if (head.tolerance) limits.push({ ...level(squeeze(head.tolerance)), yref: "y2", line: { color: colour("limit"), width: 1, dash: "dot" } });
     return plot(node, data, {
-      xaxis: axis("trial", { anchor: "y2", rangemode: "nonnegative" }),
+      xaxis: axis("trial", { anchor: "y2", range: [-0.03 * rows.length - 0.5, 1.03 * rows.length] }),
       yaxis: axis(head.loss_label, { domain: [0.5, 1], type: logarithmic ? "log" : "linear", exponentformat: "power" }),
       yaxis2: axis(`worst excess (${head.excess_unit})`, { domain: [0, 0.44], tickvals: ticks.map(squeeze), ticktext: ticks.map(String) }),
       yaxis3: { overlaying: "y", range: [0, 1], visible: false, fixedrange: true },
@@ -134,7 +134,7 @@ const Figures = (() => {
     });
     node.style.height = `${110 + 24 * entries.length}px`;
     return plot(node, [bar(down, `-${step}`, "untuned"), bar(up, `+${step}`, "tuned")], {
-      barmode: "group", bargap: 0.25, xaxis: axis(`change (${unit})`), yaxis: axis("", { autorange: "reversed", dtick: 1 }),
+      barmode: "group", bargap: 0.25, xaxis: axis(`change (${unit})`, { exponentformat: "e" }), yaxis: axis("", { autorange: "reversed", dtick: 1 }),
       showlegend: true, legend: { orientation: "h", y: 1.01, yanchor: "bottom", x: 0 }, margin: { l: 48, r: 12, t: 30, b: 40 },
     });
   }

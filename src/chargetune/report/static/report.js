@@ -19,10 +19,9 @@
     };
     const entries = shown.map(({ label, colour, dash }) => ({ label, colour, dash }));
     if (others.length) entries.push({ label: `trials (${others.length} shown)`, colour: "trials" });
-    Figures.legend(where("legend"), [...entries, { label: "limit", colour: "limit", dash: true }]);
-    const first = shown.find(({ drawing }) => drawing.panels.length) || { drawing: others.find(({ panels }) => panels.length) || shown[0]?.drawing };
-    for (const panel of first.drawing?.panels || []) {
-      // A signal that only the other trials have keeps its label and limits from where it was found first.
+    if (where("legend")) Figures.legend(where("legend"), [...entries, { label: "limit", colour: "limit", dash: true }]);
+    const first = [...shown.map(({ drawing }) => drawing), ...others].find(({ panels }) => panels.length);
+    for (const panel of first?.panels || []) {
       add("signals", panel.label, false, (node) => Figures.overTime(node, panel, shown, others));
     }
     for (const { key, label } of shown[0]?.drawing.profiles || []) {
