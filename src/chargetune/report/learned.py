@@ -43,7 +43,7 @@ def current_limit_values(problem: ChargingProblem, nodes: ArrayLike, soc: ArrayL
     """The current limit in A with these node values, shares of the largest current: piecewise linear. Raises ValueError without one."""
     if problem.current_limit is None:
         raise ValueError("current_limit is not part of this problem's theta")
-    share = np.interp(soc, problem.current_limit.grid, np.asarray(nodes, dtype=float))
+    share = np.interp(np.asarray(soc, dtype=float), problem.current_limit.grid, np.asarray(nodes, dtype=float))
     return np.asarray((problem.current_max_A or 0.0) * share, dtype=np.float64)
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from typing import Any
 
+from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
 from chargetune.report.convergence import excess_unit, loss, worst_excess
 from chargetune.report.reading import StudyView
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["study_head", "study_summary", "theta_document", "trial_row"]
+__all__ = ["study_head", "study_summary", "theta_document", "trace_csv", "trial_row"]
 
 
 def study_head(view: StudyView) -> dict[str, Any]:
@@ -102,6 +107,34 @@ def theta_document(view: StudyView, trial: Trial) -> dict[str, Any]:
         "units": {p.name: p.unit for p in view.space.parameters},
         "provenance": dict(trial.provenance),
     }
+
+
+def trace_csv(episode: Episode) -> str:
+    """A trace as CSV: one row an interval, units in the headings, every number to the last bit.
+
+    Outputs have two columns, ``name`` at the start of the interval and ``name end``; ``true`` ones follow where they are known.
+    """
+    columns: dict[str, NDArray[Any]] = {"time_s": episode.time_s}
+    for i, (name, unit) in enumerate(zip(episode.input_names, episode.input_units, strict=True)):
+        columns[_heading(name, unit)] = episode.input[:, i]
+    pairs = [("", episode.output_start, episode.output_end)]
+    if episode.true_start is not None and episode.true_end is not None:
+        pairs.append(("true ", episode.true_start, episode.true_end))
+    for before, starts, ends in pairs:
+        for i, (name, unit) in enumerate(zip(episode.output_names, episode.output_units, strict=True)):
+            columns[f"{before}{_heading(name, unit)}"] = starts[:, i]
+            columns[f"{before}{_heading(name, unit)} end"] = ends[:, i]
+    columns |= {f"estimated {name}": episode.estimate[:, i] for i, name in enumerate(episode.estimate_names)}
+    columns |= {"solver status": episode.status, "solver residual": episode.kkt, "solver iterations": episode.iterations}
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _heading(name: str, unit: str) -> str:
+    return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} [{unit}]"
 
 
 def _finite(value: float | None) -> float | None:

@@ -57,7 +57,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
     base, _, _ = problem(np.array(trial.theta), trial.seed)
     centre, out = space.to_unit(np.array(trial.theta)), []
     for i, entry in enumerate(space.entries):
-        changes = []
+        changes: list[tuple[float | None, float | None, float | None]] = []
         for step in (-STEP, STEP):
             moved = centre.copy()
             moved[i] += step

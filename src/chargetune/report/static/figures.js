@@ -2,7 +2,7 @@
 // The figures of a page: one drawing function a kind, used by the report and by the live page alike.
 const Figures = (() => {
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-  const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+  const CONFIG = { displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
 
   function axis(title, more) {
     const line = colour("line");
@@ -139,6 +139,11 @@ const Figures = (() => {
     });
   }
 
+  // plotly looks at the window only, but a figure also becomes narrower when others come beside it.
+  const resizing = new ResizeObserver((changes) => {
+    for (const { target } of changes) if (target.classList.contains("js-plotly-plot") && target.clientWidth) Plotly.Plots.resize(target);
+  });
+
   // A figure in the page: caption and place for the plot.
   function place(parent, caption, tall = false) {
     const figure = document.createElement("figure"), text = document.createElement("figcaption"), node = document.createElement("div");
@@ -146,6 +151,7 @@ const Figures = (() => {
     node.className = tall ? "plot tall" : "plot";
     figure.append(text, node);
     parent.append(figure);
+    resizing.observe(node);
     return node;
   }
 

@@ -1,0 +1,43 @@
+"""chargetune web."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from chargetune.cli.output import console
+from chargetune.study.store import Store
+
+__all__ = ["web_command"]
+
+
+def web_command(path: Path, *, port: int, host: str, token: str | None) -> None:
+    """Serve a store until Ctrl-C."""
+    try:
+        import uvicorn
+
+        from chargetune.web.app import make_app
+        from chargetune.web.guard import LEAST_TOKEN, is_loopback
+    except ModuleNotFoundError as error:
+        raise ValueError(f"chargetune web needs {error.name}: pip install 'chargetune[web]'") from error
+    if token is None and not is_loopback(host):
+        raise ValueError(f"--host {host} can be reached from other machines: give a --token of at least {LEAST_TOKEN} characters")
+    if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise ValueError(f"--token has {len(token)} characters, allowed are at least {LEAST_TOKEN} printable ASCII ones")
+    with Store(path, read_only=True):
+        pass  # what cannot be shown is refused now
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, port), family=family) as listening:
+        bound = listening.getsockname()[1]
+        config = uvicorn.Config(
+            make_app(path, token=token, hosts=frozenset({host.lower()})),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            # Event streams never end by themselves.
+            timeout_graceful_shutdown=1,
+        )
+        where = f"[{host}]" if family == socket.AF_INET6 else host
+        secret = "" if token is None else " (once with ?token=... behind it)"
+        console().print(f"{path}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
+        uvicorn.Server(config).run(sockets=[listening])

@@ -1,0 +1,1 @@
+"""A read-only live view of a store in the browser. starlette is imported when the application is made."""
