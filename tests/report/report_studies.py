@@ -8,8 +8,12 @@ from scipy.stats import qmc
 
 from chargetune.battery.config import BackoffTable, Config, ControllerTable, EpisodeTable, LimitsTable, RatioTable, StudyTable, ThetaTable
 from chargetune.episode.episode import Ending
+from chargetune.episode.score import Score
+from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.study.document import space_to_json
 from chargetune.study.store import Store
 from chargetune.study.study import Study
+from chargetune.study.trial import Trial
 
 TRIALS = 10
 CUT = 20
@@ -23,7 +27,7 @@ class LocalSobol:
     seed: int = 2
 
     def ask(self, space, trials, n=1):
-        points = qmc.Sobol(space.dimension, rng=self.seed).random(64)
+        points = qmc.Sobol(space.dimension, rng=self.seed).random(128)
         start = space.to_unit(space.default)
         thetas = space.from_unit(start + self.reach * (points - start))
         thetas[0] = space.default
@@ -41,7 +45,7 @@ def charging(tuner="sobol", *, tolerance_V=0.0005):
     )
 
 
-def run_charging(path, config, *, reach=0.7, cut=(), raising=()):
+def run_charging(path, config, *, reach=0.7, cut=(), raising=(), trials=TRIALS):
     """Run the study; trials in ``cut`` fail and leave the start of their trace, those in ``raising`` fail without any."""
     problem, numbers = config.problem(), count()
 
@@ -58,7 +62,26 @@ def run_charging(path, config, *, reach=0.7, cut=(), raising=()):
         Store(path) as store,
         Study.create_or_resume(store, config.study.name, config=config.document(), space=problem.space, tuner=LocalSobol(reach)) as study,
     ):
-        study.run(evaluate, TRIALS)
+        study.run(evaluate, trials)
+    return path
+
+
+HOSTILE = '<script>alert("x")</script>&amp;"\'</title>'
+
+
+def other_study(path, name=HOSTILE):
+    """A study that is not about a battery, with a name that wants to be markup."""
+    space = ParameterSpace((Parameter("gain", 0.1, 10.0, 1.0, scale="log"), Parameter("shift", -1.0, 1.0, 0.0)))
+    with Store(path) as store:
+        record = store.add_study(name, {"config": {"what": HOSTILE}, "space": space_to_json(space), "tuner": {}, "seed": 0, "batch": 1})
+        for n in range(12):
+            x = (1.0, 0.0) if n == 0 else (0.1 + 0.5 * n, np.sin(n))
+            store.add_trials(record.id, [Trial(n, x)])
+            score = Score(-float(n), -1.0 - n, {HOSTILE: 0.5 - n}, {HOSTILE: 0.0}, {"cost": 1.0 * n})
+            if n == 11:
+                store.finish_trial(record.id, n, score=None, ending=HOSTILE, trace=None, provenance={})
+            else:
+                store.finish_trial(record.id, n, score=score, ending="done", trace=None, provenance={"versions": {HOSTILE: HOSTILE}})
     return path
 
 

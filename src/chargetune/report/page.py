@@ -12,7 +12,7 @@ from chargetune.report import sections
 from chargetune.report.markup import packed, plotly_js, section, static
 from chargetune.report.panels import trial_drawing
 from chargetune.report.reading import StudyView
-from chargetune.report.rows import study_head, trial_row
+from chargetune.report.rows import study_head, trial_rows
 from chargetune.report.sensitivity import STEP, Sensitivity, finite_differences
 
 __all__ = ["report_page"]
@@ -46,7 +46,7 @@ def report_page(view: StudyView, *, evaluate: bool = True, progress: Callable[[]
     others = [trial_drawing(view, r, OTHERS_POINTS) for r in view.readings(some)]
     data = {
         "head": study_head(view),
-        "rows": [trial_row(view, t) for t in view.trials],
+        "rows": trial_rows(view, view.trials),
         "shown": shown,
         "others": others,
         "sensitivity": _bars(moved),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from chargetune.report.convergence import excess_unit, loss, worst_excess
 from chargetune.report.reading import StudyView
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["study_head", "study_summary", "theta_document", "trace_csv", "trial_row"]
+__all__ = ["study_head", "study_summary", "theta_document", "trace_csv", "trial_rows"]
 
 
 def study_head(view: StudyView) -> dict[str, Any]:
@@ -56,25 +57,28 @@ def limits_of(view: StudyView) -> list[dict[str, Any]]:
     return inputs + outputs
 
 
-def trial_row(view: StudyView, trial: Trial) -> dict[str, Any]:
-    """One trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head; None: no score.
+def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """One row a trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head; None: no score.
 
     ``counted`` says whether it may be the incumbent: a trial within the limits, for the tuner "ei" any with a score.
     """
-    score, (_, scale) = trial.score, excess_unit(view)
-    return {
-        "number": trial.number,
-        "status": trial.status.value,
-        "ending": trial.ending or "",
-        "feasible": None if score is None else score.feasible,
-        "counted": score is not None and (view.tuner == "ei" or score.feasible),
-        "loss": _finite(loss(view, trial)),
-        "excess": _finite(scale * worst_excess(trial)),
-        "metrics": {} if score is None else {name: _finite(v) for name, v in score.metrics.items()},
-        "asked_at": trial.asked_at,
-        "told_at": trial.told_at or "",
-        "trace": trial.trace_sha256 is not None,
-    }
+    _, scale = excess_unit(view)
+    return [
+        {
+            "number": trial.number,
+            "status": trial.status.value,
+            "ending": trial.ending or "",
+            "feasible": None if trial.score is None else trial.feasible,
+            "counted": trial.score is not None and (view.tuner == "ei" or trial.feasible),
+            "loss": _finite(loss(view, trial)),
+            "excess": _finite(scale * worst_excess(trial)),
+            "metrics": {} if trial.score is None else {name: _finite(v) for name, v in trial.score.metrics.items()},
+            "asked_at": trial.asked_at,
+            "told_at": trial.told_at or "",
+            "trace": trial.trace_sha256 is not None,
+        }
+        for trial in trials
+    ]
 
 
 def study_summary(view: StudyView) -> dict[str, Any]:

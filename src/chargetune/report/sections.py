@@ -28,7 +28,8 @@ def opening(view: StudyView) -> str:
     if best is None:
         verdict = paragraph("No trial has a score: there is no result.", "bad")
     elif not best.feasible:
-        verdict = paragraph(f"No trial kept the limits. Shown as tuned is the one that came closest, trial {best.number}.", "bad")
+        why = "it has the best performance G, which weighs violations" if view.tuner == "ei" else "no trial did, and it came closest"
+        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits: {why}.", "bad")
     else:
         verdict = paragraph(f"Result: trial {best.number}, which kept every limit. {_minutes(view)}", "good")
     note = '<p id="drawing">The figures are being drawn.</p>\n<noscript><p class="bad">The figures need JavaScript.</p></noscript>\n'
@@ -92,7 +93,7 @@ def result(view: StudyView) -> str:
     figures = [
         (name, *(t.score.metrics.get(name) if t is not None and t.score is not None else None for t in (untuned, best))) for name in names
     ]
-    what = "Best theta within the limits" if best.feasible else "theta that came closest to the limits"
+    what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
     return section(what, table(headings, rows), table(("figure of merit", "untuned", f"trial {best.number}"), figures))
 
 

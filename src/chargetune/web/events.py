@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 from chargetune.report.reading import StudyView
-from chargetune.report.rows import study_head, study_summary, trial_row
+from chargetune.report.rows import study_head, study_summary, trial_rows
 from chargetune.study.store import StoreError
 from chargetune.web.watch import StoreWatch
 
@@ -56,7 +56,7 @@ async def study_events(watch: StoreWatch, study_id: int) -> AsyncIterator[bytes]
             yield _event("study", head)
         fresh = [t for t in view.trials if sent.get(t.number) != t.status]
         if fresh or not sent:
-            rows = await asyncio.to_thread(lambda v, ts: [trial_row(v, t) for t in ts], view, fresh)
+            rows = await asyncio.to_thread(trial_rows, view, fresh)
             untuned, tuned = view.untuned, view.tuned
             sent |= {t.number: t.status for t in fresh}
             yield _event(

@@ -70,7 +70,7 @@ const Figures = (() => {
   }
 
   // Linear within 1 on either side of the limit, logarithmic beyond.
-  const squeeze = (value) => Math.sign(value) * Math.log10(1 + Math.abs(value));
+  const squeeze = (value) => value === null ? null : Math.sign(value) * Math.log10(1 + Math.abs(value));
 
   function incumbents(rows) {
     let best = null;
@@ -90,7 +90,7 @@ const Figures = (() => {
       const some = rows.filter(belongs), x = some.map((row) => row.number), marker = { color: colour(ink), symbol, size: 7 };
       data.push({ x, y: some.map((row) => row.loss), name, mode: "markers", marker, hovertemplate: "trial %{x}: %{y:.5g}<extra></extra>" });
       data.push({
-        x, y: some.map((row) => squeeze(row.excess)), text: some.map((row) => row.excess.toPrecision(4)), name, yaxis: "y2", mode: "markers",
+        x, y: some.map((row) => squeeze(row.excess)), text: some.map((row) => row.excess?.toPrecision(4) ?? ""), name, yaxis: "y2", mode: "markers",
         marker, showlegend: false, hovertemplate: `trial %{x}: %{text} ${head.excess_unit}<extra></extra>`,
       });
     }

@@ -3,7 +3,9 @@
 const BASE = location.pathname.replace(/\/$/, "");
 const where = (id) => document.getElementById(id);
 const rows = new Map(), lines = new Map(), drawings = new Map(), places = new Map();
-const sorting = { key: "number", down: true };
+// A browser takes seconds over a table of thousands of lines: more are added when one scrolls to the end.
+const MORE = 100;
+const sorting = { key: "number", down: true, count: MORE };
 let head = null, untuned = null, tuned = null, tunedLabel = "tuned", chosen = fromAddress();
 let columns = [];
 
@@ -42,6 +44,8 @@ function findColumns() {
     button.addEventListener("click", () => {
       sorting.down = sorting.key === column.key ? !sorting.down : false;
       sorting.key = column.key;
+      sorting.count = MORE;
+      where("table").scrollTop = 0;
       showTable();
     });
     heading.append(button);
@@ -69,7 +73,6 @@ function tableLine(row) {
 
 function showTable() {
   findColumns();
-  for (const row of rows.values()) if (!lines.has(row.number)) lines.set(row.number, tableLine(row));
   const value = columns.find(({ key }) => key === sorting.key).value, sign = sorting.down ? -1 : 1;
   const none = (v) => v === null || v === "" || v === undefined;
   // What has no value stays below, whichever way.
@@ -78,7 +81,10 @@ function showTable() {
     if (none(x) || none(y)) return none(x) - none(y) || a.number - b.number;
     return (x < y ? -1 : x > y ? 1 : 0) * sign || a.number - b.number;
   });
-  where("rows").replaceChildren(...sorted.map((row) => lines.get(row.number)));
+  where("rows").replaceChildren(...sorted.slice(0, sorting.count).map((row) => {
+    if (!lines.has(row.number)) lines.set(row.number, tableLine(row));
+    return lines.get(row.number);
+  }));
   for (const heading of where("headings").children) {
     heading.ariaSort = heading.dataset.key === sorting.key ? (sorting.down ? "descending" : "ascending") : "none";
   }
@@ -102,6 +108,14 @@ function choose(number) {
 where("rows").addEventListener("click", (event) => {
   const line = event.target.closest("tr");
   if (line) choose(Number(line.dataset.number));
+});
+
+where("table").addEventListener("scroll", () => {
+  const { scrollTop, clientHeight, scrollHeight } = where("table");
+  if (scrollTop + 2 * clientHeight > scrollHeight && sorting.count < rows.size) {
+    sorting.count += MORE;
+    showTable();
+  }
 });
 
 // The figures
@@ -143,6 +157,15 @@ function place(parent, key, caption, tall = false) {
   return places.get(id);
 }
 
+// The largest file by far: the table need not wait for it.
+const plotly = new Promise((loaded, failed) => {
+  const script = document.createElement("script");
+  script.addEventListener("load", loaded);
+  script.addEventListener("error", () => failed(new Error("plotly.js did not load")));
+  script.src = "/static/plotly.js";
+  document.head.append(script);
+});
+
 let drawingNow = false, drawAgain = false;
 
 // One drawing at a time; what changes meanwhile is drawn right after it.
@@ -166,15 +189,9 @@ async function draw() {
 
 async function drawOnce() {
   const entries = wanted();
-  const list = [...rows.values()].sort((a, b) => a.number - b.number);
-  const marked = entries.filter(({ colour }) => colour !== "trials").map((entry) => ({ ...entry, row: rows.get(entry.number) }));
-  const all = place("convergence", "all", "each trial, and the best so far; a point can be chosen", true);
-  await Figures.convergence(all, head, list, marked);
-  if (!all.dataset.listens) {
-    all.dataset.listens = "yes";
-    all.on("plotly_click", ({ points }) => choose(points[0].x));
-  }
-  const shown = (await Promise.all(entries.map(async (entry) => ({ ...entry, drawing: await drawing(entry.number) })))).filter((entry) => entry.drawing);
+  const asked = Promise.all(entries.map(async (entry) => ({ ...entry, drawing: await drawing(entry.number) })));
+  const [drawn] = await Promise.all([asked, plotly]);
+  const shown = drawn.filter((entry) => entry.drawing);
   Figures.legend(where("legend"), [...shown, { label: "limit", colour: "limit", dash: true }]);
   const panels = new Map(), profiles = new Map();
   for (const { drawing: found } of shown) {
@@ -187,6 +204,14 @@ async function drawOnce() {
   const learned = [...profiles.values()].map(({ key, label }) => [place("profiles", key, label), key]);
   for (const [node, panel] of signals) await Figures.overTime(node, panel, shown);
   for (const [node, key] of learned) await Figures.overSoc(node, key, shown);
+  const list = [...rows.values()].sort((a, b) => a.number - b.number);
+  const marked = entries.filter(({ colour }) => colour !== "trials").map((entry) => ({ ...entry, row: rows.get(entry.number) }));
+  const all = place("convergence", "all", "each trial, and the best so far; a point can be chosen", true);
+  await Figures.convergence(all, head, list, marked);
+  if (!all.dataset.listens) {
+    all.dataset.listens = "yes";
+    all.on("plotly_click", ({ points }) => choose(points[0].x));
+  }
   where("message").textContent = shown.filter(({ number, drawing: found }) => found.message && chosen.includes(number))
     .map(({ number, drawing: found }) => `Trial ${number}: ${found.message}.`).join(" ");
   compare(shown);
