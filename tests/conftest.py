@@ -1,6 +1,7 @@
 """Settings for every test process."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,41 @@ for library in ("OMP", "OPENBLAS", "MKL"):
 settings.register_profile("here", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "here")
+
+
+# What a test says that did not run because there is no browser.
+NO_BROWSER = "no Chromium on this machine"
+GET_BROWSER = "apt-get install --yes --no-install-recommends chromium"
+# Nothing but the page itself: no accelerator, no second protocol, no calls of its own to the outside.
+QUIET = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A running Chromium, the machine's own. Where there is none the test is skipped, and the closing lines say so."""
+    from playwright.sync_api import sync_playwright
+
+    found = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip(NO_BROWSER)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=list(QUIET))
+        yield browser
+        browser.close()
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say which tests did not run for want of a browser, and how to get one: a skip must not pass unseen."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    without = [r.nodeid for r in skipped if isinstance(r.longrepr, tuple) and NO_BROWSER in r.longrepr[2]]
+    if without:
+        terminalreporter.section(f"{len(without)} tests did not run: {NO_BROWSER}", red=True, bold=True)
+        for name in without:
+            terminalreporter.line(name)
+        terminalreporter.line(f"To run them: {GET_BROWSER} && make test")
 
 
 @pytest.fixture(scope="session")

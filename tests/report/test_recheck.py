@@ -45,6 +45,6 @@ def test_disagreement_and_a_current_beyond_its_bound(stores):
     verdicts = {c.name: c.agrees for c in recheck(view.problem, episode, score)}
     assert verdicts == {"current_min_A": True, "current_max_A": True, "voltage_max_V": True, "voltage_min_V": False}
     more = replace(episode, input=episode.input + 0.5)
-    assert [c.name for c in recheck(view.problem, more, None) if not c.kept][0] == "current_max_A"
+    assert next(c.name for c in recheck(view.problem, more, None) if not c.kept) == "current_max_A"
     assert recheck(view.problem, episode.cut(0, episode.ending, ""), None) == []
     assert np.isfinite([c.excess for c in recheck(view.problem, episode, None)]).all()

@@ -58,9 +58,9 @@ def limits_of(view: StudyView) -> list[dict[str, Any]]:
 
 
 def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """One row a trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head; None: no score.
+    """One row a trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head.
 
-    ``counted`` says whether it may be the incumbent: a trial within the limits, for the tuner "ei" any with a score.
+    Both are None without a score. ``counted``: it may be the incumbent, being within the limits, or for the tuner "ei" scored.
     """
     _, scale = excess_unit(view)
     return [

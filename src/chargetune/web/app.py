@@ -7,6 +7,7 @@ import gzip
 import json
 import os
 import re
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,7 @@ def _own(name: str) -> bytes:
     return resources.files("chargetune.web").joinpath("static", name).read_bytes()
 
 
+@cache
 def _files() -> dict[str, tuple[dict[str, bytes], str]]:
     """Every file that a page may ask for: its content by encoding, and its type."""
     contents = {name: static(name).encode() for name in ("look.css", "figures.js")}

@@ -51,13 +51,15 @@ class StoreWatch:
 
     def _fingerprint(self) -> tuple[Fingerprint, bool]:
         """Identity, size and time of the database and of its log, and whether the newest of them has some age."""
-        marks, newest = [], 0.0
+        marks: list[tuple[int, int, int]] = []
+        newest = 0.0
         for path in (self.path, self.path.with_name(self.path.name + "-wal")):
             try:
                 found = path.stat()
             except OSError:
-                marks.append((0, 0, 0))
                 continue
-            marks.append((found.st_ino, found.st_size, found.st_mtime_ns))
-            newest = max(newest, found.st_mtime)
+            # An empty log says nothing, and comes and goes with those who only read.
+            if found.st_size:
+                marks.append((found.st_ino, found.st_size, found.st_mtime_ns))
+                newest = max(newest, found.st_mtime)
         return tuple(marks), time.time() - newest > SETTLED_S

@@ -1,0 +1,49 @@
+"""One store with a study of each kind, and a server of it as `chargetune web` runs it."""
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import uvicorn
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "report"))
+
+from report_studies import charging, other_study, run_charging
+
+from chargetune.web.app import make_app
+
+
+@pytest.fixture(scope="session")
+def store(tmp_path_factory):
+    """Study 1 charges a battery, study 2 has markup for a name and no traces."""
+    path = tmp_path_factory.mktemp("web") / "store.sqlite"
+    run_charging(path, charging(tolerance_V=0.035), cut=(3,), raising=(6,))
+    return other_study(path)
+
+
+@pytest.fixture(scope="session")
+def serve():
+    """A function that serves a store on a free port of this machine while its context lasts, and gives the address."""
+
+    @contextlib.contextmanager
+    def run(path, **options):
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            config = uvicorn.Config(make_app(path, **options), log_level="error", timeout_graceful_shutdown=1)
+            server = uvicorn.Server(config)
+            thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+            thread.start()
+            end = time.monotonic() + 20
+            while not server.started:
+                assert time.monotonic() < end, "the server does not start"
+                time.sleep(0.02)
+            try:
+                yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+            finally:
+                server.should_exit = True
+                thread.join(10)
+
+    return run
