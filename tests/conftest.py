@@ -27,7 +27,8 @@ QUIET = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="session")
+# Not for the whole session: while playwright runs, its thread has an event loop, and no other test could start one.
+@pytest.fixture(scope="module")
 def chromium():
     """A running Chromium, the machine's own. Where there is none the test is skipped, and the closing lines say so."""
     from playwright.sync_api import sync_playwright

@@ -32,8 +32,8 @@ def serve():
     @contextlib.contextmanager
     def run(path, **options):
         with socket.create_server(("127.0.0.1", 0)) as listening:
-            config = uvicorn.Config(make_app(path, **options), log_level="error", timeout_graceful_shutdown=1)
-            server = uvicorn.Server(config)
+            app = make_app(path, ending=lambda: server.should_exit, **options)
+            server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=3))
             thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
             thread.start()
             end = time.monotonic() + 20

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 from pathlib import Path
 
@@ -30,14 +31,16 @@ def web_command(path: Path, *, port: int, host: str, token: str | None) -> None:
     with socket.create_server((host, port), family=family) as listening:
         bound = listening.getsockname()[1]
         config = uvicorn.Config(
-            make_app(path, token=token, hosts=frozenset({host.lower()})),
+            make_app(path, token=token, hosts=frozenset({host.lower()}), ending=lambda: server.should_exit),
             log_level="warning",
             access_log=False,
             server_header=False,
-            # Event streams never end by themselves.
-            timeout_graceful_shutdown=1,
+            timeout_graceful_shutdown=3,
         )
+        server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
         console().print(f"{path}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
-        uvicorn.Server(config).run(sockets=[listening])
+        # uvicorn passes Ctrl-C on once it has ended in good order.
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])

@@ -25,7 +25,7 @@ from chargetune.report.reading import Reading, StudyView
 from chargetune.report.rows import theta_document, trace_csv
 from chargetune.study.store import StoreError
 from chargetune.study.trial import Trial
-from chargetune.web.events import list_events, study_events
+from chargetune.web.events import Ending, list_events, study_events
 from chargetune.web.guard import Guard
 from chargetune.web.watch import StoreWatch
 
@@ -34,8 +34,16 @@ __all__ = ["make_app"]
 TYPES = {"css": "text/css", "js": "text/javascript", "html": "text/html"}
 
 
-def make_app(store_path: str | os.PathLike[str], *, token: str | None = None, hosts: frozenset[str] = frozenset()) -> ASGIApp:
+def make_app(
+    store_path: str | os.PathLike[str],
+    *,
+    token: str | None = None,
+    hosts: frozenset[str] = frozenset(),
+    ending: Ending = lambda: False,
+) -> ASGIApp:
     """The application for one store. ``hosts`` are further names of this machine that a request without token may ask for.
+
+    ``ending`` is asked twice a second whether the server is about to end; then the streams do too.
 
     A study and a trial are addressed by number, a file by its name in a table made here: no path from outside is ever opened.
     """
@@ -58,11 +66,11 @@ def make_app(store_path: str | os.PathLike[str], *, token: str | None = None, ho
         return _compressed(request, content, kind)
 
     async def list_stream(_request: Request) -> Response:
-        return _stream(list_events(watch))
+        return _stream(list_events(watch, ending))
 
     async def study_stream(request: Request) -> Response:
-        view = await _study(watch, request)
-        return _stream(study_events(watch, view.record.id if view.record else 0))
+        await _study(watch, request)
+        return _stream(study_events(watch, request.path_params["study"], ending))
 
     async def trial(request: Request) -> Response:
         view, reading = await _reading(watch, request)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
 from chargetune.report.reading import StudyView
@@ -12,7 +12,7 @@ from chargetune.report.rows import study_head, study_summary, trial_rows
 from chargetune.study.store import StoreError
 from chargetune.web.watch import StoreWatch
 
-__all__ = ["list_events", "study_events"]
+__all__ = ["Ending", "list_events", "study_events"]
 
 PERIOD_S = 0.5
 # A line now and then tells proxies, and this process, that the other side is still there.
@@ -20,10 +20,18 @@ ALIVE_S = 15.0
 ALIVE = b": alive\n\n"
 
 
-async def list_events(watch: StoreWatch) -> AsyncIterator[bytes]:
+# Whether the server is about to end: a stream would hold it for ever.
+Ending = Callable[[], bool]
+
+
+def _never() -> bool:
+    return False
+
+
+async def list_events(watch: StoreWatch, ending: Ending = _never) -> AsyncIterator[bytes]:
     """``studies``: the summary of every study, at once and whenever one changed."""
     sent: object = None
-    async for views in _changes(watch, None):
+    async for views in _changes(watch, None, ending):
         if isinstance(views, str):
             sent = None
             yield _event("trouble", {"message": views})
@@ -36,11 +44,11 @@ async def list_events(watch: StoreWatch) -> AsyncIterator[bytes]:
             sent = summaries
 
 
-async def study_events(watch: StoreWatch, study_id: int) -> AsyncIterator[bytes]:
+async def study_events(watch: StoreWatch, study_id: int, ending: Ending = _never) -> AsyncIterator[bytes]:
     """``study``: its head, at once and when it changed; ``trials``: rows of new and newly told trials, all of them after a head."""
     head: Mapping[str, Any] | None = None
     sent: dict[int, str] = {}
-    async for views in _changes(watch, study_id):
+    async for views in _changes(watch, study_id, ending):
         if views is None:
             yield ALIVE
             continue
@@ -70,11 +78,11 @@ async def study_events(watch: StoreWatch, study_id: int) -> AsyncIterator[bytes]
             )
 
 
-async def _changes(watch: StoreWatch, study_id: int | None) -> AsyncIterator[list[StudyView] | str | None]:
+async def _changes(watch: StoreWatch, study_id: int | None, ending: Ending) -> AsyncIterator[list[StudyView] | str | None]:
     """The studies whenever they were read anew, the trouble with the store as text when it begins, None from time to time."""
     last: object = None
     idle = 0.0
-    while True:
+    while not ending():
         now: list[StudyView] | str
         try:
             if study_id is None:

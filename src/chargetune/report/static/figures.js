@@ -114,6 +114,8 @@ const Figures = (() => {
     const losses = rows.map((row) => row.loss).filter((value) => value !== null);
     // Below a decade a logarithmic axis says no more than a linear one.
     const logarithmic = losses.length > 0 && Math.min(...losses) > 0 && Math.max(...losses) > 10 * Math.min(...losses);
+    // Without any score there is no curve in the lower half, and plotly would leave out the axis that the upper one stands on.
+    if (!losses.length) data.push({ x: [0], y: [null], yaxis: "y2", mode: "lines", showlegend: false });
     const ticks = [-1000, -100, -10, -1, 0, 1, 10, 100, 1000];
     const limits = [{ ...level(0), yref: "y2" }];
     if (head.tolerance) limits.push({ ...level(squeeze(head.tolerance)), yref: "y2", line: { color: colour("limit"), width: 1, dash: "dot" } });
