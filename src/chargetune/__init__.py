@@ -1,6 +1,6 @@
 """Tuning of model predictive charging controllers in closed loop.
 
-cell -> model -> controller(theta) -> plant -> episode -> score -> tuner -> trial -> study -> report
+cell -> model -> controller(theta) -> plant -> episode -> score -> tuner -> trial -> study -> report, web
 
 Signs and units everywhere: current is positive when it charges; volts, amperes, seconds, ohm, farad, kelvin; state of
 charge from 0 to 1; capacity in ampere-hours. Where a person types a number its name carries the unit (``voltage_max_V``).

@@ -38,6 +38,10 @@ const Figures = (() => {
     return { x, y, mode: "lines", line: { color: colour("trials"), width: 0.6 }, opacity: 0.55, hoverinfo: "skip", connectgaps: false };
   }
 
+  const heading = (text, y) => ({
+    text, xref: "paper", yref: "paper", x: 0, y, xanchor: "left", yanchor: "bottom", showarrow: false, font: { color: colour("faint") },
+  });
+
   const find = (list, key) => list.find((entry) => entry.key === key);
 
   // shown: [{label, colour, dash, drawing}], from the back to the front.
@@ -108,7 +112,7 @@ const Figures = (() => {
     for (const { row, label, colour: ink } of marked) {
       if (!row || row.loss === null) continue;
       const marker = { color: colour(ink), symbol: "circle-open", size: 15, line: { width: 2.5 } };
-      data.push({ x: [row.number], y: [row.loss], name: label, mode: "markers", marker, hoverinfo: "skip" });
+      data.push({ x: [row.number], y: [row.loss], name: label, mode: "markers", marker, hoverinfo: "skip", showlegend: false });
       data.push({ x: [row.number], y: [squeeze(row.excess)], yaxis: "y2", mode: "markers", marker, hoverinfo: "skip", showlegend: false });
     }
     const losses = rows.map((row) => row.loss).filter((value) => value !== null);
@@ -121,11 +125,13 @@ const Figures = (() => {
     if (head.tolerance) limits.push({ ...level(squeeze(head.tolerance)), yref: "y2", line: { color: colour("limit"), width: 1, dash: "dot" } });
     return plot(node, data, {
       xaxis: axis("trial", { anchor: "y2", range: [-0.03 * rows.length - 0.5, 1.03 * rows.length] }),
-      yaxis: axis(head.loss_label, { domain: [0.5, 1], type: logarithmic ? "log" : "linear", exponentformat: "power" }),
-      yaxis2: axis(`worst excess (${head.excess_unit})`, { domain: [0, 0.44], tickvals: ticks.map(squeeze), ticktext: ticks.map(String) }),
+      yaxis: axis("", { domain: [0.54, 1], type: logarithmic ? "log" : "linear", exponentformat: "power" }),
+      yaxis2: axis("", { domain: [0, 0.42], tickvals: ticks.map(squeeze), ticktext: ticks.map(String) }),
       yaxis3: { overlaying: "y", range: [0, 1], visible: false, fixedrange: true },
-      shapes: limits, showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
-      margin: { l: 56, r: 12, t: 36, b: 40 },
+      // Beside the axes the titles would take what a narrow screen has of width.
+      annotations: [heading(head.loss_label, 1), heading(`worst excess (${head.excess_unit})`, 0.42)],
+      shapes: limits, showlegend: true, legend: { orientation: "h", y: 1.07, yanchor: "bottom", x: 0 },
+      margin: { l: 48, r: 12, t: 56, b: 40 },
     });
   }
 

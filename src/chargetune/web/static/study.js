@@ -233,22 +233,22 @@ function compare(shown) {
       return [link, " "];
     });
   }));
-  const titles = ["", "unit", ...picked.map(({ number }) => `trial ${number}`), ...(picked.length === 2 ? ["difference"] : [])];
+  const titles = ["", ...picked.map(({ number }) => `trial ${number}`), ...(picked.length === 2 ? ["difference"] : [])];
   where("compared-head").replaceChildren(...titles.map((title, i) => {
     const heading = document.createElement("th");
     heading.scope = "col";
-    heading.className = i < 2 ? "text" : "";
+    heading.className = i ? "" : "text";
     heading.textContent = title;
     return heading;
   }));
   const body = [];
-  const add = (name, unit, values) => {
+  const add = (name, values) => {
     const line = document.createElement("tr");
     const numbers = values.every((value) => typeof value === "number");
-    const texts = [name, unit, ...values.map(short), ...(values.length === 2 ? [numbers ? short(values[1] - values[0]) : "-"] : [])];
+    const texts = [name, ...values.map(short), ...(values.length === 2 ? [numbers ? short(values[1] - values[0]) : "-"] : [])];
     texts.forEach((text, i) => {
       const node = document.createElement("td");
-      node.className = i < 2 ? "text" : "";
+      node.className = i ? "" : "long text";
       node.textContent = text;
       line.append(node);
     });
@@ -256,10 +256,10 @@ function compare(shown) {
   };
   const both = picked.map(({ number }) => rows.get(number));
   for (const column of [...FIXED.slice(1), ...columns.filter(({ metric }) => metric)]) {
-    const unit = column.key === "excess" ? head.excess_unit : "";
-    add(column.title, unit, both.map((row) => column.value(row)));
+    const unit = column.key === "excess" ? ` (${head.excess_unit})` : "";
+    add(`${column.title}${unit}`, both.map((row) => column.value(row)));
   }
-  for (const { entry, unit } of head.theta) add(entry, unit === "1" ? "" : unit, picked.map(({ drawing: found }) => found.theta[entry]));
+  for (const { entry, unit } of head.theta) add(unit === "1" ? entry : `${entry} (${unit})`, picked.map(({ drawing: found }) => found.theta[entry]));
   where("compared-rows").replaceChildren(...body);
 }
 
