@@ -3,12 +3,12 @@ import io
 import json
 import re
 import sqlite3
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import plotly
 import pytest
+from html_check import parsed
 from report_studies import HOSTILE, charging, run_charging
 from starlette.testclient import TestClient
 
@@ -33,10 +33,7 @@ def test_pages_hold_no_script_or_style_of_their_own(client, path):
     found = client.get(path)
     assert found.status_code == 200
     assert found.headers["content-type"].startswith("text/html")
-    tags = []
-    parser = HTMLParser()
-    parser.handle_starttag = lambda tag, attributes: tags.append((tag, dict(attributes)))
-    parser.feed(found.text)
+    tags = parsed(found.text).tags
     for tag, attributes in tags:
         assert tag != "style"
         assert "style" not in attributes

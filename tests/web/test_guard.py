@@ -1,6 +1,7 @@
 import asyncio
 
 import pytest
+from html_check import parsed
 from starlette.testclient import TestClient
 
 from chargetune.web.app import make_app
@@ -30,6 +31,7 @@ def test_without_the_token_nothing_is_shown(store, path, bring):
     found = visitor.get(path, **bring)
     assert found.status_code == 401
     assert "Token needed" in found.text
+    parsed(found.text)
     assert TOKEN not in found.text
     assert "set-cookie" not in found.headers
 

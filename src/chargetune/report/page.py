@@ -9,6 +9,7 @@ from typing import Any
 
 from chargetune import __version__
 from chargetune.report import sections
+from chargetune.report.convergence import excess_unit
 from chargetune.report.markup import packed, plotly_js, section, static
 from chargetune.report.panels import trial_drawing
 from chargetune.report.reading import StudyView
@@ -49,7 +50,7 @@ def report_page(view: StudyView, *, evaluate: bool = True, progress: Callable[[]
         "rows": trial_rows(view, view.trials),
         "shown": shown,
         "others": others,
-        "sensitivity": _bars(moved),
+        "sensitivity": _bars(view, moved),
     }
     every = [*drawings.values(), *others]
     body = (
@@ -96,12 +97,13 @@ def _document(title: str, body: str, data: str) -> str:
 """
 
 
-def _bars(moved: Sequence[Sensitivity]) -> list[dict[str, Any]]:
+def _bars(view: StudyView, moved: Sequence[Sensitivity]) -> list[dict[str, Any]]:
     step, out = f"{100 * STEP:g} % of its range", []
+    limit_unit, limit_scale = excess_unit(view)
     for field, caption, unit, scale in (
         ("minutes", "time to 95 % SOC when one entry of theta is moved", "s", 60.0),
         ("objective", "objective when one entry of theta is moved (larger is better)", "objective", 1.0),
-        ("excess", "worst excess over all limits when one entry of theta is moved", "unit of the limit", 1.0),
+        ("excess", "worst excess over all limits when one entry of theta is moved", limit_unit, limit_scale),
     ):
         pairs = [getattr(m, field) for m in moved]
         sides = [[None if p[i] is None else scale * p[i] for p in pairs] for i in (0, 1)]
