@@ -27,11 +27,11 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def serve():
-    """A function that serves a store on a free port of this machine while its context lasts, and gives the address."""
+    """A function that serves a store on a port of this machine, a free one by default, while its context lasts, and gives the address."""
 
     @contextlib.contextmanager
-    def run(path, **options):
-        with socket.create_server(("127.0.0.1", 0)) as listening:
+    def run(path, port=0, **options):
+        with socket.create_server(("127.0.0.1", port)) as listening:
             app = make_app(path, ending=lambda: server.should_exit, **options)
             server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=3))
             thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)

@@ -20,6 +20,16 @@ EXPECTED = "Applying inline style violates"
 FIRST_LINE = """document.addEventListener("DOMContentLoaded", () => {
   new MutationObserver(() => { window.firstLine_ms ??= performance.now(); }).observe(document.getElementById("rows"), { childList: true });
 });"""
+# Which of 3000 trials are drawn as points, when 1234 has the largest loss and 777 the smallest excess.
+MANY = """async () => {
+  const row = (number) => ({ number, status: "done", loss: 2 + Math.sin(number), excess: Math.cos(number), feasible: true, counted: true });
+  const rows = Array.from({ length: 3000 }, (_, number) => row(number)), node = document.createElement("div");
+  rows[1234].loss = 99;
+  rows[777].excess = -55;
+  document.body.append(node);
+  await Figures.convergence(node, head, rows);
+  return node.data.filter((trace) => trace.name === "within limits").map((trace) => trace.x);
+}"""
 DRAWN = "html[data-drawn]"
 
 
@@ -215,11 +225,17 @@ def test_a_running_study_is_followed_within_two_seconds(open_page, tmp_path, ser
         assert page.wrong == listed.wrong == []
 
 
-def test_the_server_going_away_is_said(open_page, store, serve):
+def test_the_server_going_away_is_said_and_its_return_too(open_page, store, serve):
     with serve(store) as where:
         page = open_page(f"{where}/studies/1", wait=DRAWN)
         assert page.locator("#state").inner_text() == "live"
     page.wait_for_function("() => document.getElementById('state').textContent.includes('no connection')")
+    port = int(where.rpartition(":")[2])
+    with serve(store, port=port):
+        page.wait_for_function("() => document.getElementById('state').textContent === 'live'")
+    page.wait_for_function("() => document.getElementById('state').textContent.includes('no connection')")
+    with serve(store, port=port, token=TOKEN):
+        page.wait_for_function("() => document.getElementById('state').textContent.includes('refuses')")
 
 
 def test_two_thousand_trials(open_page, tmp_path, serve):
@@ -246,6 +262,11 @@ def test_two_thousand_trials(open_page, tmp_path, serve):
         page.evaluate("document.getElementById('table').scrollTop = 1e6")
         page.wait_for_function(f"() => document.querySelectorAll('#rows tr').length > {before}")
         page.wait_for_selector(DRAWN, state="attached")
+        losses, excesses = page.evaluate(MANY)
+        assert 1234 in losses
+        assert 777 in excesses
+        assert max(len(losses), len(excesses)) <= 450
+        assert page.wrong == []
 
 
 @pytest.mark.parametrize("width", [390, 1400])

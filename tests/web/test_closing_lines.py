@@ -15,5 +15,5 @@ def test_tests_without_a_browser_are_named(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     closing = done.stdout[done.stdout.index("1 tests did not run: no Chromium on this machine") :]
-    assert "tests/web/test_browser.py::test_the_server_going_away_is_said" in closing
+    assert "tests/web/test_browser.py::test_the_server_going_away_is_said_and_its_return_too" in closing
     assert "To run them: apt-get install --yes --no-install-recommends chromium && make test" in closing

@@ -84,18 +84,39 @@ const Figures = (() => {
     });
   }
 
+  // Thousands of points cost a browser a second and cannot be told apart: of neighbours the smallest, the largest and one more are kept.
+  const STRETCHES = 150;
+
+  function extremes(list, value) {
+    if (list.length <= 3 * STRETCHES) return list;
+    const kept = new Set();
+    for (let i = 0; i < STRETCHES; i += 1) {
+      const part = list.slice(Math.floor((i * list.length) / STRETCHES), Math.floor(((i + 1) * list.length) / STRETCHES));
+      kept.add(part.reduce((a, b) => (value(b) < value(a) ? b : a)));
+      kept.add(part.reduce((a, b) => (value(b) > value(a) ? b : a)));
+      kept.add(part[Math.floor(part.length / 2)]);
+    }
+    return list.filter((row) => kept.has(row));
+  }
+
   function convergence(node, head, rows, marked = []) {
     const kinds = [
       ["within limits", "ok", "circle", (row) => row.feasible === true],
       ["violating", "limit", "triangle-up-open", (row) => row.feasible === false],
     ];
     const data = [];
+    let thinned = false;
     for (const [name, ink, symbol, belongs] of kinds) {
-      const some = rows.filter(belongs), x = some.map((row) => row.number), marker = { color: colour(ink), symbol, size: 7 };
-      data.push({ x, y: some.map((row) => row.loss), name, mode: "markers", marker, hovertemplate: "trial %{x}: %{y:.5g}<extra></extra>" });
+      const all = rows.filter(belongs), marker = { color: colour(ink), symbol, size: 7 };
+      thinned = thinned || all.length > 3 * STRETCHES;
+      const upper = extremes(all, (row) => row.loss), lower = extremes(all, (row) => row.excess);
       data.push({
-        x, y: some.map((row) => squeeze(row.excess)), text: some.map((row) => row.excess?.toPrecision(4) ?? ""), name, yaxis: "y2", mode: "markers",
-        marker, showlegend: false, hovertemplate: `trial %{x}: %{text} ${head.excess_unit}<extra></extra>`,
+        x: upper.map((row) => row.number), y: upper.map((row) => row.loss), name, mode: "markers", marker,
+        hovertemplate: "trial %{x}: %{y:.5g}<extra></extra>",
+      });
+      data.push({
+        x: lower.map((row) => row.number), y: lower.map((row) => squeeze(row.excess)), text: lower.map((row) => row.excess?.toPrecision(4) ?? ""),
+        name, yaxis: "y2", mode: "markers", marker, showlegend: false, hovertemplate: `trial %{x}: %{text} ${head.excess_unit}<extra></extra>`,
       });
     }
     const failed = rows.filter((row) => row.status === "failed");
@@ -129,7 +150,7 @@ const Figures = (() => {
       yaxis2: axis("", { domain: [0, 0.42], tickvals: ticks.map(squeeze), ticktext: ticks.map(String) }),
       yaxis3: { overlaying: "y", range: [0, 1], visible: false, fixedrange: true },
       // Beside the axes the titles would take what a narrow screen has of width.
-      annotations: [heading(head.loss_label, 1), heading(`worst excess (${head.excess_unit})`, 0.42)],
+      annotations: [heading(head.loss_label + (thinned ? "; not every trial, but every extreme one" : ""), 1), heading(`worst excess (${head.excess_unit})`, 0.42)],
       shapes: limits, showlegend: true, legend: { orientation: "h", y: 1.07, yanchor: "bottom", x: 0 },
       margin: { l: 48, r: 12, t: 56, b: 40 },
     });

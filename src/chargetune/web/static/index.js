@@ -34,6 +34,8 @@ source.addEventListener("trouble", (event) => {
   state.className = "bad";
 });
 source.onerror = () => {
-  state.textContent = "no connection to the server, trying again";
+  // A browser tries again by itself unless it was refused.
+  const refused = source.readyState === EventSource.CLOSED;
+  state.textContent = refused ? "the server refuses; load the page again" : "no connection to the server, trying again";
   state.className = "bad";
 };

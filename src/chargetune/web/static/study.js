@@ -300,7 +300,11 @@ source.addEventListener("trials", (event) => {
   draw();
 });
 source.addEventListener("trouble", (event) => state(JSON.parse(event.data).message, "bad"));
-source.onerror = () => state("no connection to the server, trying again", "bad");
+source.onerror = () => {
+  // A browser tries again by itself unless it was refused.
+  const refused = source.readyState === EventSource.CLOSED;
+  state(refused ? "the server refuses; load the page again" : "no connection to the server, trying again", "bad");
+};
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => head && draw());
 window.addEventListener("hashchange", () => {
   chosen = fromAddress();
