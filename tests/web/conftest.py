@@ -16,6 +16,10 @@ from report_studies import charging, other_study, run_charging
 
 from chargetune.web.app import make_app
 
+TIMEOUT_MS = 20_000
+# A style of the maps in plotly.js, which no figure here has: the policy refuses it, and the browser says so.
+EXPECTED = "Applying inline style violates"
+
 
 @pytest.fixture(scope="session")
 def store(tmp_path_factory):
@@ -47,3 +51,28 @@ def serve():
                 thread.join(10)
 
     return run
+
+
+@pytest.fixture
+def open_page(chromium):
+    """A function that opens an address in a fresh context and notes what goes wrong in it."""
+    contexts = []
+
+    def run(address, width=1400, scheme="light", wait=None, watch=""):
+        context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(TIMEOUT_MS)
+        page.wrong = []
+        page.on("pageerror", lambda error: page.wrong.append(str(error)))
+        page.on("console", lambda m: page.wrong.append(m.text) if m.type == "error" and EXPECTED not in m.text else None)
+        page.on("dialog", lambda dialog: (page.wrong.append("a script of the store ran"), dialog.dismiss()))
+        page.add_init_script(watch)
+        page.goto(address)
+        if wait:
+            page.wait_for_selector(wait, state="attached")
+        return page
+
+    yield run
+    for context in contexts:
+        context.close()

@@ -1,61 +1,12 @@
 """The live page and the report in a real browser."""
 
-import threading
-import time
-from itertools import count
-
 import numpy as np
 import pytest
-from report_studies import HOSTILE, TRIALS, LocalSobol, charging
+from report_studies import HOSTILE, TRIALS
 
 from chargetune.report import read_study, report_page
-from chargetune.study.store import Store
-from chargetune.study.study import Study
 
-TOKEN = "correct horse battery"
-TIMEOUT_MS = 20_000
-# A style of the maps in plotly.js, which no figure here has: the policy refuses it, and the browser says so.
-EXPECTED = "Applying inline style violates"
-# Notes when the table of trials has its first line, in milliseconds since the browser was sent to the page.
-FIRST_LINE = """document.addEventListener("DOMContentLoaded", () => {
-  new MutationObserver(() => { window.firstLine_ms ??= performance.now(); }).observe(document.getElementById("rows"), { childList: true });
-});"""
-# Which of 3000 trials are drawn as points, when 1234 has the largest loss and 777 the smallest excess.
-MANY = """async () => {
-  const row = (number) => ({ number, status: "done", loss: 2 + Math.sin(number), excess: Math.cos(number), feasible: true, counted: true });
-  const rows = Array.from({ length: 3000 }, (_, number) => row(number)), node = document.createElement("div");
-  rows[1234].loss = 99;
-  rows[777].excess = -55;
-  document.body.append(node);
-  await Figures.convergence(node, head, rows);
-  return node.data.filter((trace) => trace.name === "within limits").map((trace) => trace.x);
-}"""
 DRAWN = "html[data-drawn]"
-
-
-@pytest.fixture
-def open_page(chromium):
-    """A function that opens an address in a fresh context and notes what goes wrong in it."""
-    contexts = []
-
-    def run(address, width=1400, scheme="light", wait=None, watch=""):
-        context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(TIMEOUT_MS)
-        page.wrong = []
-        page.on("pageerror", lambda error: page.wrong.append(str(error)))
-        page.on("console", lambda m: page.wrong.append(m.text) if m.type == "error" and EXPECTED not in m.text else None)
-        page.on("dialog", lambda dialog: (page.wrong.append("a script of the store ran"), dialog.dismiss()))
-        page.add_init_script(watch)
-        page.goto(address)
-        if wait:
-            page.wait_for_selector(wait, state="attached")
-        return page
-
-    yield run
-    for context in contexts:
-        context.close()
 
 
 @pytest.fixture(scope="module")
@@ -168,105 +119,6 @@ def test_nothing_is_wider_than_a_phone(open_page, address, path, scheme):
         assert plot.bounding_box()["width"] <= 390
     bright = [int(v) for v in page.evaluate("getComputedStyle(document.body).backgroundColor").strip("rgb()").split(",")]
     assert (sum(bright) > 3 * 128) == (scheme == "light")
-
-
-def test_token_is_refused_and_accepted(open_page, store, serve):
-    with serve(store, token=TOKEN) as where:
-        page = open_page(f"{where}/studies/1")
-        assert "Token needed" in page.inner_text("body")
-        page.get_by_label("Token").fill("not the right one")
-        page.get_by_role("button", name="Enter").click()
-        page.wait_for_load_state()
-        assert "Token needed" in page.inner_text("body")
-        page.get_by_label("Token").fill(TOKEN)
-        page.get_by_role("button", name="Enter").click()
-        page.wait_for_selector(DRAWN, state="attached")
-        assert page.url == f"{where}/studies/1"
-        assert page.locator("#state").inner_text() == "live"
-
-
-def test_a_running_study_is_followed_within_two_seconds(open_page, tmp_path, serve):
-    """A real study runs beside the browser; from each told trial to its line in the table less than 2 s pass."""
-    config, path = charging(), tmp_path / "live.sqlite"
-    problem, numbers = config.problem(), count()
-    go, told = threading.Semaphore(0), {}
-
-    def evaluate(theta, seed):
-        go.acquire()
-        if next(numbers) == 2:
-            raise RuntimeError("the cycler lost its connection")
-        return problem(theta, seed)
-
-    def run():
-        with (
-            Store(path) as opened,
-            Study.create_or_resume(opened, "live", config=config.document(), space=problem.space, tuner=LocalSobol()) as study,
-        ):
-            study.run(evaluate, 5, progress=lambda t, *_: told.update({t.number: time.monotonic()}))
-
-    Store(path).close()
-    with serve(path) as where:
-        listed = open_page(where)
-        listed.wait_for_function("() => document.getElementById('state').textContent.includes('no studies yet')")
-        worker = threading.Thread(target=run, daemon=True)
-        worker.start()
-        listed.get_by_role("link", name="live").wait_for()
-        page = open_page(f"{where}/studies/1", wait="tr[data-number='0']")
-        assert "running" in page.locator("tr[data-number='0']").inner_text()
-        for number in range(5):
-            go.release()
-            page.wait_for_function(f"() => /done|failed/.test(document.querySelector(\"tr[data-number='{number}']\")?.textContent)")
-            assert time.monotonic() - told[number] < 2.0
-        worker.join()
-        page.wait_for_function("() => document.documentElement.dataset.drawn === '5'")
-        assert "failed" in page.locator("tr[data-number='2']").inner_text()
-        listed.wait_for_function("() => document.querySelector('#studies tr').children[1].textContent === '4'")
-        assert page.locator("#counts").inner_text().startswith("5 trials:")
-        assert page.wrong == listed.wrong == []
-
-
-def test_the_server_going_away_is_said_and_its_return_too(open_page, store, serve):
-    with serve(store) as where:
-        page = open_page(f"{where}/studies/1", wait=DRAWN)
-        assert page.locator("#state").inner_text() == "live"
-    page.wait_for_function("() => document.getElementById('state').textContent.includes('no connection')")
-    port = int(where.rpartition(":")[2])
-    with serve(store, port=port):
-        page.wait_for_function("() => document.getElementById('state').textContent === 'live'")
-    page.wait_for_function("() => document.getElementById('state').textContent.includes('no connection')")
-    with serve(store, port=port, token=TOKEN):
-        page.wait_for_function("() => document.getElementById('state').textContent.includes('refuses')")
-
-
-def test_two_thousand_trials(open_page, tmp_path, serve):
-    """The table is there within 2 s; its further lines come when one scrolls, so that it stays so."""
-    from chargetune.episode.score import Score
-    from chargetune.study.document import space_to_json
-    from chargetune.study.trial import Trial
-
-    config, path = charging(), tmp_path / "big.sqlite"
-    space = config.problem().space
-    with Store(path) as opened:
-        identity = {"config": config.document(), "space": space_to_json(space), "tuner": {}, "seed": 0, "batch": 1}
-        record = opened.add_study("big", identity)
-        opened.add_trials(record.id, [Trial(n, tuple(space.default)) for n in range(2000)])
-        for n in range(0, 2000, 100):
-            score = Score(-0.1 - 1e-4 * n, -1.0, {"voltage_max_V": -0.01}, {"voltage_max_V": 0.0}, {"t80_min": 20.0 + 1e-2 * n})
-            opened.finish_trial(record.id, n, score=score, ending="done", trace=None, provenance={})
-    with serve(path) as where:
-        open_page(where, wait="#studies tr")
-        page = open_page(f"{where}/studies/1", wait="#rows tr", watch=FIRST_LINE)
-        assert page.evaluate("firstLine_ms") < 2000
-        assert page.locator("#counts").inner_text().startswith("2000 trials")
-        before = page.locator("#rows tr").count()
-        page.evaluate("document.getElementById('table').scrollTop = 1e6")
-        page.wait_for_function(f"() => document.querySelectorAll('#rows tr').length > {before}")
-        page.wait_for_selector(DRAWN, state="attached")
-        losses, excesses = page.evaluate(MANY)
-        assert 1234 in losses
-        assert 777 in excesses
-        assert max(len(losses), len(excesses)) <= 450
-        assert page.wrong == []
 
 
 @pytest.mark.parametrize("width", [390, 1400])
