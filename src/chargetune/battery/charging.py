@@ -231,6 +231,28 @@ class ChargingProblem:
             estimator=self._estimator(),
         )
 
+    def measured_rows(self, episode: Episode) -> NDArray[np.float64]:
+        """By how much the rows of the controller's limits were exceeded on the plant, backoff left out, shape (K, 2, rows)."""
+        rows = self._rows
+        both = [np.stack(episode.signal(limit.signal), axis=1) for limit in rows]
+        return np.stack(
+            [values - limit.bound if limit.upper else limit.bound - values for limit, values in zip(rows, both, strict=True)], axis=2
+        )
+
+    @property
+    def row_tolerances(self) -> NDArray[np.float64]:
+        """The excess still called kept of each of these rows, shape (rows,)."""
+        return np.array([limit.tolerance for limit in self._rows])
+
+    @property
+    def _rows(self) -> list[Limit]:
+        """Limits that the controller keeps, in the order of its own; of one signal the upper before the lower."""
+        by_signal: dict[str, list[Limit]] = {}
+        for limit in self.limits:
+            if limit.kind != "scored":
+                by_signal.setdefault(limit.signal, []).append(limit)
+        return [limit for group in by_signal.values() for limit in sorted(group, key=lambda one: not one.upper)]
+
     def _soft_limits(self) -> list[SoftLimit]:
         """The limits that the controller sees, upper and lower bound of the same output together."""
         margins: dict[str, Callable[[Stage], Any]] = {part.of: part.margin for part in self.limit_backoffs}
@@ -299,6 +321,7 @@ class ChargingProblem:
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
         # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
+        metrics["violation_mVs"] = self.violation_mVs(episode)
         metrics["current_max_excess_A"] = float(np.max(episode.input[:, 0]) - (self.current_max_A or 0.0))
         for limit in self.limits[2:]:
             metrics |= limit.metrics(episode)
@@ -310,6 +333,13 @@ class ChargingProblem:
             metrics=metrics,
             profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
         )
+
+    def violation_mVs(self, episode: Episode) -> float:
+        """Excess of the upper voltage limit beyond its tolerance, in the moving mean of the verdict, over time, mV s."""
+        limit = self.limits[0]
+        samples = self.verdict_samples if self.sensors.noise_sd.get(limit.signal, 0.0) > 0 else 1
+        beyond = np.maximum(0.0, np.nan_to_num(limit.excess(episode, samples)) - limit.tolerance)
+        return float(1e3 * episode.sampling_time_s * np.sum(beyond))
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:
         """Evaluate theta: (score, episode, ending); no score when the episode did not come to its end."""

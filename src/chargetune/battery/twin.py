@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,19 +12,23 @@ from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
-from chargetune.episode.episode import Ending
+from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
+    from chargetune.learning.discrepancy import OutputError
     from chargetune.learning.twin import Twin
 
 __all__ = ["ChargingTwin"]
 
 # A voltage sensor without stated noise is trusted to this, V; a temperature sensor to this, K.
 LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05}
+# A circuit's prediction is off by at least about this where it was not measured.
+LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3}
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 
@@ -51,16 +56,46 @@ class ChargingTwin:
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = tuple(Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables)
-        return Twin(model, unknowns, noise, start_state(belief, problem.soc_start))
+        error = {name: LEAST_ERROR[name] for name in names}
+        return Twin(model, unknowns, noise, start_state(belief, problem.soc_start), error)
 
-    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64]) -> Score | None:
-        """The verdict on one charge without noise."""
+    @property
+    def features(self) -> Mapping[str, tuple[float, float]]:
+        """What the circuit's error depends on: SOC, current and, where it is measured, temperature."""
+        problem = self.problem
+        ranges = {"soc": (0.0, 1.0), "current_A": (problem.current_min_A, problem.current_max_A or 0.0)}
+        thermal = problem.controller_cell.thermal
+        if thermal:
+            ranges["temperature_K"] = (thermal.ambient_K, (problem.temperature_max_K or thermal.ambient_K + 30.0) + 5.0)
+        return ranges
+
+    @property
+    def controller(self) -> Controller:
+        return self.problem.controller
+
+    def measured_rows(self, episode: Episode) -> NDArray[np.float64]:
+        return self.problem.measured_rows(episode)
+
+    @property
+    def row_tolerances(self) -> NDArray[np.float64]:
+        return self.problem.row_tolerances
+
+    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64], error: OutputError | None = None) -> Episode | None:
+        """One charge without noise, ``error`` added to what it measures."""
         sizes = self.twin.model.parameter_blocks
         values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
         plant = replace(self._loop.plant, model=self._loop.plant.model.with_parameters(**dict(zip(sizes, values, strict=True))))
         episode = replace(self._loop, plant=plant).run(theta)
         if episode.ending is not Ending.DONE:
             return None
+        return error(episode) if error else episode
+
+    def violation(self, episode: Episode) -> float:
+        """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""
+        return self.problem.violation_mVs(episode)
+
+    def score(self, episode: Episode) -> Score | None:
+        """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
         try:
             return self._exact.score(episode)
         except ValueError:

@@ -20,12 +20,17 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from chargetune.episode.episode import Episode
+from chargetune.learning.posterior import Posterior
 from chargetune.model.model import Model
 
-__all__ = ["Posterior", "Twin", "Uncertain"]
+__all__ = ["BLOCKS", "Twin", "Uncertain", "blocks"]
 
 # Refits with a discrepancy taken from the residuals; it changes by less than a tenth after the second.
 REFITS = 2
+# Stretches of an episode over which residuals are averaged: what a model cannot represent changes slowly.
+BLOCKS = 40
+# A step that changes the misfit, or the unknowns, by less than this is the last one.
+FTOL, XTOL = 1e-6, 1e-5
 
 
 @dataclass(frozen=True)
@@ -58,13 +63,16 @@ class Twin:
     """A `Model` of the plant, what of it is unknown, and which outputs are measured with what noise.
 
     ``noise_sd`` maps the measured outputs to the standard deviation of one sample, ``start`` the states at the start of every
-    trial to their nominal value (others are 0). Raises ValueError for what the model does not have.
+    trial to their nominal value (others are 0). ``error_sd`` is by how much at least an output may be off at the largest input
+    where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input. Raises
+    ValueError for what the model does not have.
     """
 
     model: Model
     unknowns: tuple[Uncertain, ...]
     noise_sd: Mapping[str, float]
     start: Mapping[str, float] = field(default_factory=dict)
+    error_sd: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         model = self.model
@@ -75,7 +83,9 @@ class Twin:
         names = [(one.name, one.kind == "start") for one in self.unknowns]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"twin: unknowns = {[n for n, _ in names]}, allowed is each once, at least one")
-        for label, given, allowed in (("noise_sd", self.noise_sd, model.output_names), ("start", self.start, model.state_names)):
+        outputs = tuple(self.noise_sd)
+        named = (("noise_sd", outputs, model.output_names), ("start", self.start, model.state_names), ("error_sd", self.error_sd, outputs))
+        for label, given, allowed in named:
             unknown = sorted(set(given) - set(allowed))
             if unknown:
                 raise ValueError(f"twin: {label} names {unknown}, allowed are {', '.join(allowed)}")
@@ -113,17 +123,29 @@ class Twin:
         flat = np.array(_simulation(self, len(inputs))[0](m, inputs.T))
         return flat.T.reshape(len(inputs), 2, len(self.noise_sd))
 
-    def fit(self, episodes: Sequence[Episode], *, discrepancy: bool = True) -> Posterior:
+    def slopes(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Exact slopes of `predict` with respect to m, shape (K, 2, number of measured outputs, d)."""
+        flat = np.array(_simulation(self, len(inputs))[1](m, inputs.T))
+        return flat.reshape(len(inputs), 2, len(self.noise_sd), -1)
+
+    def measured(self, episode: Episode) -> NDArray[np.float64]:
+        """The measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
+        return np.stack([np.stack(episode.signal(name), axis=1) for name in self.noise_sd], axis=2)
+
+    def fit(self, episodes: Sequence[Episode], *, discrepancy: bool = True, guess: NDArray[np.float64] | None = None) -> Posterior:
         """The posterior from the measured outputs of these episodes; samples that are not finite are left out.
 
-        With ``discrepancy`` the residuals at the mode say how much the model cannot represent: their mean square above the
-        noise is added to the variance of each output, and the fit is repeated. Without episodes it is the prior.
+        With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with
+        the variance it adds. Where the means of whole stretches are not zero, neighbouring residuals have one cause, and all
+        samples of a stretch together count as one. ``guess`` is where the search for the mode begins. Without episodes it is
+        the prior.
         """
         names, factor = list(self.noise_sd), self.prior_factor
-        data = [(e.input, np.stack([np.stack(e.signal(name), axis=1) for name in names], axis=2)) for e in episodes if len(e)]
+        data = [(e.input, self.measured(e)) for e in episodes if len(e)]
         noise = np.array([self.noise_sd[name] for name in names])
-        spread, e, cost_jacobian = noise, np.zeros(len(factor)), np.eye(len(factor))
-        for _ in range(1 + (REFITS if discrepancy and data else 0)):
+        e = np.zeros(len(factor)) if guess is None or not data else np.linalg.solve(factor, guess)
+        spread, cost_jacobian, unmodelled = noise, np.eye(len(factor)), np.zeros(len(names))
+        for _ in range(1 + REFITS):
 
             def residuals(e: NDArray[np.float64], spread: NDArray[np.float64] = spread) -> NDArray[np.float64]:
                 parts = [np.nan_to_num((self.predict(factor @ e, u) - y) / spread, nan=0.0).ravel() for u, y in data]
@@ -132,47 +154,48 @@ class Twin:
             def jacobian(e: NDArray[np.float64], spread: NDArray[np.float64] = spread) -> NDArray[np.float64]:
                 parts = []
                 for u, y in data:
-                    slopes = np.array(_simulation(self, len(u))[1](factor @ e, u.T)).reshape(len(u), 2, len(names), -1)
+                    slopes = self.slopes(factor @ e, u)
                     seen = np.isfinite(y)[..., None]
                     parts.append((np.where(seen, slopes, 0.0) / spread[:, None]).reshape(-1, len(e)) @ factor)
                 return np.vstack([np.eye(len(e)), *parts])
 
-            found = least_squares(residuals, e, jac=jacobian, method="trf", x_scale=1.0, max_nfev=30)
+            found = least_squares(residuals, e, jac=jacobian, method="trf", x_scale=1.0, max_nfev=30, ftol=FTOL, xtol=XTOL)
             e, cost_jacobian = found.x, found.jac
-            if data:
-                left = [(self.predict(factor @ e, u) - y) for u, y in data]
-                square = np.array([np.nanmean(np.concatenate([r[..., k].ravel() for r in left]) ** 2) for k in range(len(names))])
-                spread = np.maximum(noise, np.sqrt(np.where(np.isfinite(square), square, 0.0))) if discrepancy else noise
-        _, sizes, directions = np.linalg.svd(cost_jacobian, full_matrices=False)
-        root = factor @ (directions.T / sizes)
-        return Posterior(self, factor @ e, root, np.sqrt(np.maximum(spread**2 - noise**2, 0.0)))
+            if not (data and discrepancy):
+                break
+            before = spread
+            unmodelled, spread = _unmodelled([y - self.predict(factor @ e, u) for u, y in data], noise)
+            if np.allclose(spread, before, rtol=0.02):
+                break
+        # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.
+        curvature, directions = np.linalg.eigh(cost_jacobian.T @ cost_jacobian)
+        root = factor @ (directions / np.sqrt(curvature))
+        return Posterior(self, factor @ e, root, unmodelled, spread, tuple((u, np.isfinite(y)) for u, y in data))
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """m ~ N(mode, root root') for the unknowns of ``twin``, and the standard deviation of what the model cannot represent, per output."""
+def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means over `BLOCKS` stretches, of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= BLOCKS, n)."""
+    means, counts = [], []
+    for part in np.array_split(values, min(BLOCKS, len(values))):
+        seen = np.isfinite(part)
+        count = seen.sum(axis=(0, 1))
+        total = np.where(seen, part, 0.0).sum(axis=(0, 1))
+        means.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+        counts.append(count)
+    return np.array(means), np.array(counts, dtype=np.float64)
 
-    twin: Twin
-    mode: NDArray[np.float64]
-    root: NDArray[np.float64]
-    discrepancy_sd: NDArray[np.float64]
 
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        return self.root @ self.root.T
-
-    def draw(self, count: int, seed: int) -> NDArray[np.float64]:
-        """Unknowns of ``count`` plants that the data allow, shape (count, d)."""
-        normal = np.random.default_rng(seed).standard_normal((count, self.root.shape[1]))
-        return np.asarray(self.mode + normal @ self.root.T, dtype=np.float64)
-
-    def predicted_sd(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation of a new noisy sample of each measured output under ``inputs``, shape (K, 2, outputs): by linearisation."""
-        twin = self.twin
-        slopes = np.array(_simulation(twin, len(inputs))[1](self.mode, inputs.T)).reshape(len(inputs), 2, len(twin.noise_sd), -1)
-        noise = np.array(list(twin.noise_sd.values()))
-        variance = np.sum((slopes @ self.root) ** 2, axis=-1) + self.discrepancy_sd**2 + noise**2
-        return np.asarray(np.sqrt(variance), dtype=np.float64)
+def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """From residuals: (standard deviation of what the model cannot represent, that of a sample as the likelihood takes it)."""
+    means, counts = (np.concatenate(parts) for parts in zip(*(blocks(r) for r in left), strict=True))
+    known = counts > 0
+    size = np.maximum(known.sum(axis=0), 1)
+    block = np.where(known, means, 0.0) ** 2 - np.where(known, noise**2 / np.maximum(counts, 1.0), 0.0)
+    slow = np.maximum(block.sum(axis=0) / size, 0.0)
+    square = np.concatenate([r.reshape(-1, len(noise)) for r in left]) ** 2
+    whole = np.maximum(np.nanmean(np.where(np.isfinite(square).any(axis=0), square, 0.0), axis=0) - noise**2, slow)
+    together = counts.sum(axis=0) / size
+    return np.sqrt(whole), np.sqrt(noise**2 + together * slow + (whole - slow))
 
 
 def _maps(twin: Twin) -> tuple[ca.Function, ca.Function]:

@@ -2,177 +2,155 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.stats import norm
 
-from chargetune.episode.episode import Episode
-from chargetune.episode.score import Score
+from chargetune.learning.belief import Belief, TwinLoop, believe, episodes_of
+from chargetune.learning.constrained import ConstrainedLogEI
+from chargetune.learning.envelope import covering
+from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
-from chargetune.learning.twin import Posterior, Twin
+from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
-__all__ = ["TracedTrial", "TwinLoop", "TwinTuner"]
+__all__ = ["TwinTuner"]
 
-# Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
-TRACES_MAX = 6
-# Objective and excess are scaled to their spread over the pool, so that one step and one penalty fit any problem.
-PENALTY = 10.0
-# Of a limit's tolerance: what the search aims at, and what it accepts, since SLSQP ends a little on the wrong side. The rest
-# is left to noise and to what the twin does not know.
-AIMED, ACCEPTED = 0.25, 0.75
-STEP = 2e-3
-
-
-class TracedTrial(TrialLike, Protocol):
-    """A trial whose measured episode can be read; None when it has none."""
-
-    @property
-    def episode(self) -> Callable[[], Episode | None] | None: ...
-
-
-class TwinLoop(Protocol):
-    """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
-
-    @property
-    def twin(self) -> Twin: ...
-
-    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64]) -> Score | None:
-        """The verdict on a noise-free episode with the controller at theta and the plant at ``unknowns``; None when it fails."""
-        ...
+# Times more wrong than allowed for, at which a twin is none.
+MISTAKEN = 9.9
+# Plants of an ensemble; the standard error of a probability of 0.95 is 0.027.
+DRAWS = 48
+# Envelope steps on the upper side of the prediction, which is that at the theta found last.
+ROUNDS = 7
+# Beyond one limit's quantile, because several windows have to hold together.
+TOGETHER = 1.0
+# Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
+UNPROVED = 1.0
+# Factor on the deviations where that does not suffice.
+WIDER = 1.25
+# Of a limit's tolerance, what the upper side of the prediction may use.
+AIMED = 0.5
 
 
 @dataclass(frozen=True)
 class TwinTuner:
-    """First theta_0; then the theta that is best on the twin's posterior mode, further ones of a batch on posterior draws.
+    """First theta_0; then the theta that is best on the plant as the traces so far show it.
 
     Each theta solves max objective s.t. excess <= tolerance, in every window where the score has a profile, on the
-    simulated closed loop: SLSQP with finite differences of ``STEP`` in the unit cube, from the ``starts`` best of ``pool``
-    Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. The best point seen that keeps the
-    limits is proposed. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
+    simulated closed loop with the twin at its posterior mode plus the mean discrepancy (`Search`), from the ``starts`` best of
+    ``pool`` Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. Further thetas of a batch are
+    best on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
+
+    Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
+    is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
+
+    With ``safety`` the theta is one whose controller predicts the upper side of the belief: envelope steps (`covering`) on mean
+    plus some sd of an ensemble of plants. Proposed is the best one that keeps every limit on a share of the ensemble of at least
+    the stated probability; the first theta is the declared start, or the most cautious corner. Where no such theta is found
+    the best one tried that is still predicted to be safe is proposed again, with a warning; where there is none, or the budget of
+    violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant.
     """
 
     loop: TwinLoop
     seed: int = 0
-    pool: int = 128
-    starts: int = 2
-    iterations: int = 25
+    safety: Safety | None = None
+    pool: int = 32
+    steps: int = 5
+    iterations: int = 15
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
-        """``n`` thetas, shape (n, d). Raises ValueError when n is no count."""
+        """``n`` thetas, shape (n, d). Raises ValueError when n is no count, `NoSafeThetaError`."""
         check_count(n)
-        posterior = None if not trials else self.posterior(trials)
-        if posterior is None:
+        if self.safety:
+            return np.tile(self._safe(space, trials, self.safety), (n, 1))
+        belief = believe(self.loop, trials) if trials else None
+        if belief is None or belief.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
             return out[:n]
-        plants = np.vstack([posterior.mode, posterior.draw(n, self.seed + len(trials))])[:n]
+        if belief.scale >= MISTAKEN and len(trials) > 2:
+            warnings.warn(
+                f"the twin did not foresee the last trial (off by {belief.scale:.0f} times what it allows for): "
+                "this proposal is the black box's",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            return ConstrainedLogEI(self.seed).ask(space, trials, n)
+        first = self._points(space, trials)
+        plants = [belief.central, *(belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n - 1))]
+        return np.array([space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants])
+
+    def _points(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
+        """Where a search may begin: theta_0, Sobol's points, the thetas tried so far, the last one last."""
         known = [space.to_unit(np.array(t.theta)) for t in trials]
-        return np.array([self._best(space, plant, known) for plant in plants])
+        return [space.to_unit(space.default), *sobol_points(space.dimension, self.seed, 0, self.pool), *known]
 
-    def posterior(self, trials: Sequence[TrialLike]) -> Posterior | None:
-        """What the traces of these trials say; None when there is none."""
-        readers = [reader for t in trials if (reader := getattr(t, "episode", None)) is not None]
-        episodes = [e for reader in readers[-TRACES_MAX:] if (e := reader()) is not None and len(e)]
-        return self.loop.twin.fit(episodes) if episodes else None
-
-    def _best(self, space: ParameterSpace, plant: NDArray[np.float64], known: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        search = _Search(self.loop, space, plant)
-        first = [space.to_unit(space.default), *known, *sobol_points(space.dimension, self.seed, 0, self.pool)]
+    def _searched(self, search: Search, first: list[NDArray[np.float64]]) -> Search:
         search.scale(first)
-        ordered = sorted(first, key=search.merit)
-        # The theta tried last is where the twin knows the plant best; on its own it may be a local optimum.
-        for start in (*ordered[: self.starts], *known[-1:]):
+        for start in (first[0], first[-1]):
+            search.envelope(start, self.steps)
+        # The best of all so far; the best of the pool, in case a step by what is covered is not the way to it.
+        for start in (search.best(), min(first, key=search.merit)):
             search.refine(start, self.iterations)
-        return space.from_unit(search.best())
+        return search
 
+    def _safe(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> NDArray[np.float64]:
+        belief = believe(self.loop, trials)
+        if not trials:
+            return self._start(space, belief, safety)
+        self._check_budget(trials, safety)
+        seed = self.seed + 7919 * len(trials)
+        proved = len(episodes_of(trials)) > 1
+        deviations = float(norm.ppf(safety.probability)) + (TOGETHER if proved else TOGETHER + UNPROVED)
+        theta, passed = np.array(trials[-1].theta), []
+        for k in range(ROUNDS):
+            expected, predicted = belief.central(theta), belief.predict(theta, DRAWS, seed)
+            score = None if expected is None else self.loop.score(expected)
+            rows = predicted.upper_rows(deviations)
+            if expected is None or score is None or rows is None:
+                break
+            if predicted.probability() >= safety.probability:
+                passed.append((score.objective, theta))
+            elif k > 1:
+                deviations *= WIDER
+            following = covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
+            # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
+            theta = following if k < 2 else (theta + following) / 2
+        return max(passed, key=lambda one: one[0])[1] if passed else self._tried(trials, belief, safety, seed)
 
-class _Search:
-    """Values of objective and excesses on one plant, remembered by point."""
+    def _tried(self, trials: Sequence[TrialLike], belief: Belief, safety: Safety, seed: int) -> NDArray[np.float64]:
+        """The best theta that was tried, kept the limits, and is still predicted to."""
+        known = [(t.score.objective, np.array(t.theta)) for t in trials if t.score is not None and t.score.feasible]
+        for _, theta in sorted(known, key=lambda one: -one[0]):
+            if belief.predict(theta, DRAWS, seed).probability() >= safety.probability:
+                warnings.warn("no safe improvement is known: a theta that was tried is proposed again", RuntimeWarning, stacklevel=2)
+                return theta
+        what = f"no theta keeps every limit with probability {safety.probability:g}"
+        raise NoSafeThetaError(f"{what} as far as the {len(trials)} trials show; nothing was proposed")
 
-    def __init__(self, loop: TwinLoop, space: ParameterSpace, plant: NDArray[np.float64]) -> None:
-        self._loop, self._space, self._plant = loop, space, plant
-        self._seen: dict[bytes, tuple[float, NDArray[np.float64]]] = {}
-        self._beyond: dict[bytes, float] = {}
-        self._unit = (1.0, 1.0)
-        self._slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
-
-    def scale(self, points: Sequence[NDArray[np.float64]]) -> None:
-        raw = [self.values(u) for u in points]
-        objective = [value for value, _ in raw if np.isfinite(value)]
-        excess = np.concatenate([np.maximum(e, 0.0) for _, e in raw]) if raw else np.zeros(1)
-        self._unit = (float(np.ptp(objective)) or 1.0 if objective else 1.0, float(np.max(excess, initial=0.0)) or 1.0)
-
-    def values(self, u: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """(objective to be minimised, excess less tolerance of every limit and window), scaled."""
-        key = u.tobytes()
-        if key not in self._seen:
-            score = self._loop.simulate(self._space.from_unit(np.clip(u, 0.0, 1.0)), self._plant)
-            self._seen[key] = (np.inf, np.zeros(0)) if score is None else (-score.objective, _constraints(score, AIMED))
-            self._beyond[key] = np.inf if score is None else float(np.max(_constraints(score, ACCEPTED)))
-        value, excess = self._seen[key]
-        return value / self._unit[0], excess / self._unit[1]
-
-    def merit(self, u: NDArray[np.float64]) -> float:
-        value, excess = self.values(u)
-        return float(value + PENALTY * np.sum(np.maximum(excess, 0.0)))
-
-    def slopes(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        key = u.tobytes()
-        if key not in self._slopes:
-            value, excess = self.values(u)
-            gradient, jacobian = np.zeros(u.size), np.zeros((excess.size, u.size))
-            for i in range(u.size):
-                step = STEP if u[i] + STEP <= 1.0 else -STEP
-                ahead = u.copy()
-                ahead[i] += step
-                other, beyond = self.values(ahead)
-                if np.isfinite(other) and beyond.shape == excess.shape:
-                    gradient[i] = (other - value) / step
-                    both = (excess > -1.0) & (beyond > -1.0)
-                    jacobian[both, i] = (beyond[both] - excess[both]) / step
-            self._slopes[key] = gradient, jacobian
-        return self._slopes[key]
-
-    def refine(self, start: NDArray[np.float64], iterations: int) -> None:
-        if not np.isfinite(self.values(start)[0]):
+    def _check_budget(self, trials: Sequence[TrialLike], safety: Safety) -> None:
+        if safety.budget is None:
             return
-        constraint: dict[str, Any] = {
-            "type": "ineq",
-            "fun": lambda u: -np.maximum(self.values(u)[1], -1.0),
-            "jac": lambda u: -self.slopes(u)[1],
-        }
-        minimize(
-            lambda u: self.values(u)[0],
-            start,
-            jac=lambda u: self.slopes(u)[0],
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * start.size,
-            constraints=[constraint],
-            options={"maxiter": iterations, "ftol": 1e-6},
-        )
+        spent = sum(self.loop.violation(e) for e in episodes_of(trials))
+        if spent > safety.budget:
+            raise NoSafeThetaError(f"the budget of violation is spent: {spent:.4g} of {safety.budget:g}; nothing was proposed")
 
-    def best(self) -> NDArray[np.float64]:
-        """The seen point of the best objective that keeps the limits, else the one of the least worst excess."""
-
-        def rank(key: bytes) -> tuple[bool, float]:
-            worst = self._beyond[key]
-            return worst > 0, self._seen[key][0] if worst <= 0 else worst
-
-        return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
-
-
-def _constraints(score: Score, share: float) -> NDArray[np.float64]:
-    """Excess less this share of its tolerance, one entry a limit, or one a window where there is a profile.
-
-    A window that was not visited is -inf: it is kept, and says nothing of a slope.
-    """
-    out: list[float] = []
-    for name, worst in score.excess.items():
-        tolerance = share * score.tolerance.get(name, 0.0)
-        windows = score.profile.get(name, (worst,))
-        out += [-np.inf if w is None else w - tolerance for w in windows]
-    return np.array(out)
+    def _start(self, space: ParameterSpace, belief: Belief, safety: Safety) -> NDArray[np.float64]:
+        """The declared start, or the corner with the least excess over plants of the prior, which has to be safe there."""
+        if safety.start is not None:
+            return space.validate(np.array(safety.start))
+        corners = [np.concatenate(parts) for parts in product(*([np.zeros(p.size), np.ones(p.size)] for p in space.parameters))]
+        predictions = [belief.predict(space.from_unit(u), DRAWS, self.seed) for u in corners]
+        chances = [p.probability() for p in predictions]
+        worst = [float(np.nanquantile(np.nanmax(p.excess, axis=1), safety.probability)) if len(p.excess) else np.inf for p in predictions]
+        at = min(range(len(corners)), key=lambda i: (-chances[i], worst[i]))
+        if chances[at] < safety.probability:
+            raise NoSafeThetaError(
+                f"no corner of theta keeps every limit with probability {safety.probability:g} on plants of the prior "
+                f"(the most cautious one: {chances[at]:.2f}); declare a start that does"
+            )
+        return space.from_unit(corners[at])

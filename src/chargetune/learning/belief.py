@@ -1,0 +1,176 @@
+"""What the trials so far say of the plant, as plants that it could be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
+from chargetune.learning.discrepancy import Discrepancy, OutputError
+from chargetune.learning.envelope import EnvelopeLoop
+from chargetune.learning.posterior import Posterior
+from chargetune.learning.tuner import TrialLike
+from chargetune.learning.twin import Twin
+
+__all__ = ["Belief", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
+
+# Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
+TRACES_MAX = 6
+
+
+Simulate = Callable[[NDArray[np.float64]], Episode | None]
+"""theta -> the episode of one simulated plant, None when it fails."""
+
+
+class TracedTrial(TrialLike, Protocol):
+    """A trial whose measured episode can be read; None when it has none."""
+
+    @property
+    def episode(self) -> Callable[[], Episode | None] | None: ...
+
+
+class TwinLoop(EnvelopeLoop, Protocol):
+    """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
+
+    @property
+    def twin(self) -> Twin: ...
+
+    @property
+    def features(self) -> Mapping[str, tuple[float, float]]:
+        """Signals of an episode, with their ranges, that the error of the twin depends on."""
+        ...
+
+    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64], error: OutputError | None = None) -> Episode | None:
+        """A noise-free episode with the controller at theta and the plant at ``unknowns``; None when it fails.
+
+        ``error`` is what the twin cannot represent; it is added to the measured outputs.
+        """
+        ...
+
+    def score(self, episode: Episode) -> Score | None:
+        """The verdict on an episode; None when it has none."""
+        ...
+
+    def violation(self, episode: Episode) -> float:
+        """What a measured episode spent of a budget of violation: excess beyond the tolerance, over time, >= 0."""
+        ...
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet."""
+
+    loop: TwinLoop
+    posterior: Posterior
+    discrepancy: Discrepancy | None
+
+    @property
+    def scale(self) -> float:
+        """How many times more than stated the newest trial differed from what those before it foretold; 1 before two are known."""
+        return self.discrepancy.scale if self.discrepancy else 1.0
+
+    def central(self, theta: NDArray[np.float64]) -> Episode | None:
+        """The episode expected of theta: posterior mode and mean discrepancy."""
+        return self.loop.simulate(theta, *self._centre)
+
+    def plant(self, seed: int) -> Simulate:
+        """One plant drawn from the belief: theta -> episode."""
+        ((m, error),) = self._plants(1, seed)
+        return lambda theta: self.loop.simulate(theta, m, error)
+
+    def predict(self, theta: NDArray[np.float64], count: int, seed: int) -> Prediction:
+        """What ``count`` plants drawn from the belief do; the same plants for the same seed."""
+        episodes = [self.loop.simulate(theta, *plant) for plant in self._plants(count, seed)]
+        return Prediction(self.loop, tuple(episodes))
+
+    @cached_property
+    def _centre(self) -> tuple[NDArray[np.float64], OutputError | None]:
+        mode = self.posterior.mode
+        return mode, self.discrepancy.error(mode) if self.discrepancy else None
+
+    def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], OutputError | None]]:
+        if (count, seed) not in self._drawn:
+            draws = self.posterior.draw(count, seed)
+            seeds = np.random.SeedSequence(seed).generate_state(count)
+            self._drawn[count, seed] = [
+                (m, self.discrepancy.error(m, int(s)) if self.discrepancy else None) for m, s in zip(draws, seeds, strict=True)
+            ]
+        return self._drawn[count, seed]
+
+    @cached_property
+    def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], OutputError | None]]]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Episodes with one theta over an ensemble of plants; None where one failed."""
+
+    loop: TwinLoop
+    episodes: tuple[Episode | None, ...]
+
+    @cached_property
+    def excess(self) -> NDArray[np.float64]:
+        """Excess less tolerance by plant and window, in tolerances, shape (plants, windows); nan where none was visited."""
+        scores = (self.loop.score(e) for e in self.episodes if e is not None)
+        rows = [windows_of(score) for score in scores if score is not None]
+        return np.array(rows).reshape(len(rows), -1)
+
+    def probability(self, inflation: float = 1.0) -> float:
+        """Share of the plants that keep every limit within its tolerance; deviations from the median are multiplied by ``inflation``."""
+        if not len(self.excess):
+            return 0.0
+        kept = np.all(~(self._inflated(inflation) > 0), axis=1)
+        return float(np.sum(kept) / len(self.episodes))
+
+    def upper_rows(self, deviations: float) -> NDArray[np.float64] | None:
+        """mean + ``deviations`` sd of the measured rows (`EnvelopeLoop`) at each sample, shape (K, 2, rows); None where all failed."""
+        rows = [self.loop.measured_rows(e) for e in self.episodes if e is not None]
+        if not rows:
+            return None
+        longest = max(len(r) for r in rows)
+        whole = np.array([r for r in rows if len(r) == longest])
+        return np.asarray(whole.mean(axis=0) + deviations * whole.std(axis=0))
+
+    def _inflated(self, inflation: float) -> NDArray[np.float64]:
+        if inflation == 1.0:
+            return self.excess
+        middle = np.nanmedian(self.excess, axis=0)
+        return np.asarray(middle + inflation * (self.excess - middle))
+
+
+def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:
+    """Excess less this share of the tolerance, in tolerances, one entry a limit, or one a window where there is a profile.
+
+    nan for a window that was not visited. A limit without tolerance counts in its own unit.
+    """
+    out: list[float] = []
+    for name, worst in score.excess.items():
+        tolerance = score.tolerance.get(name, 0.0)
+        windows = score.profile.get(name, (worst,))
+        out += [np.nan if w is None else (w - share * tolerance) / (tolerance or 1.0) for w in windows]
+    return np.array(out)
+
+
+def episodes_of(trials: Sequence[TrialLike], newest: int | None = None) -> list[Episode]:
+    """The measured episodes of those trials that have one, of the ``newest`` of them only."""
+    readers = [reader for t in trials if (reader := getattr(t, "episode", None)) is not None]
+    return [e for reader in readers[-(newest or 0) :] if (e := reader()) is not None and len(e)]
+
+
+def believe(loop: TwinLoop, trials: Sequence[TrialLike]) -> Belief:
+    """What the traces of these trials say; the prior when there is none."""
+    episodes = tuple(episodes_of(trials, TRACES_MAX))
+    scale, guess = 1.0, None
+    if len(episodes) > 1:
+        # How well the newest trial was foretold by those before it is how far its own successor can be trusted.
+        before = loop.twin.fit(episodes[:-1])
+        scale, guess = Discrepancy(before, episodes[:-1], loop.features).calibrated_scale(episodes[-1]), before.mode
+    posterior = loop.twin.fit(episodes, guess=guess)
+    return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None)

@@ -1,0 +1,211 @@
+"""What a twin cannot represent, as a Gaussian process over what the plant went through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import SingleTaskGP
+from gpytorch.kernels import MaternKernel, ScaleKernel
+from gpytorch.means import ZeroMean
+from gpytorch.mlls import ExactMarginalLogLikelihood
+from gpytorch.priors import LogNormalPrior
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.linalg import cho_factor, cho_solve
+
+from chargetune.episode.episode import Episode
+from chargetune.learning.posterior import Posterior
+from chargetune.learning.twin import blocks
+
+__all__ = ["Discrepancy", "OutputError"]
+
+OutputError = Callable[[Episode], Episode]
+"""A predicted episode -> the same with what the twin cannot represent added to its outputs."""
+
+# Nodes of the table of a sample along each feature, by the number of features: a sample is drawn at its nodes together.
+NODES = {1: (101,), 2: (33, 15), 3: (25, 9, 6)}
+# Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
+LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
+JITTER = 1e-8
+# Neighbouring stretches that err together.
+TOGETHER = 4.0
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """b_i(s) ~ GP(0, a_i^2 k(s, s')), k Matern 5/2: y_i = h_i(x, u, p) + b_i(s) + noise for each measured output i.
+
+    s are ``features`` of an episode, signals with the range by which they are scaled: for a charge the SOC, the current and,
+    where it is measured, the temperature. The data are residuals, averaged over `BLOCKS` stretches of each episode, because
+    neighbouring residuals have the same cause. For a draw of the twin's unknowns the process is conditioned on that draw's own
+    residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
+    Hyperparameters: maximum a posteriori of the residuals at the mode (BoTorch), log-normal priors.
+    Source: Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425.
+    """
+
+    posterior: Posterior
+    episodes: tuple[Episode, ...]
+    features: Mapping[str, tuple[float, float]]
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if len(self.features) not in NODES:
+            raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {max(NODES)}")
+
+    def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
+        """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
+        names = list(self.posterior.twin.noise_sd)
+        left = self._residuals(unknowns)
+        stream = None if seed is None else np.random.default_rng(seed)
+        tables = []
+        for i, part in enumerate(self._parts):
+            table = part.gain @ left[:, i]
+            if stream is not None:
+                table = table + part.root @ stream.standard_normal(len(table))
+            tables.append(table)
+        table = self._table(np.stack(tables, axis=-1).reshape(*self._nodes, len(names)))
+        ranges = np.array(list(self.features.values())).T
+
+        def add(episode: Episode) -> Episode:
+            columns = [episode.output_names.index(name) for name in names]
+            changed = []
+            for k, outputs in enumerate((episode.output_start, episode.output_end)):
+                at = np.stack([_feature(episode, name)[k] for name in self.features], axis=1)
+                out = outputs.copy()
+                out[:, columns] += table(np.clip(at, *ranges))
+                changed.append(out)
+            return replace(episode, output_start=changed[0], output_end=changed[1])
+
+        return add
+
+    def calibrated_scale(self, episode: Episode) -> float:
+        """How many times larger than stated the discrepancy is where nothing was measured, as one episode not learnt from shows.
+
+        The most probable factor s on its standard deviation d, given by how much r each stretch of the episode, at the recorded
+        input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1). Neighbouring
+        stretches err together, so `TOGETHER` of them count as one.
+        """
+        posterior, twin = self.posterior, self.posterior.twin
+        predicted = twin.predict(posterior.mode, episode.input)
+        columns = [episode.output_names.index(name) for name in twin.noise_sd]
+        filled = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
+        filled.output_start[:, columns], filled.output_end[:, columns] = predicted[:, 0], predicted[:, 1]
+        filled = self.error(posterior.mode)(filled)
+        left, counts = blocks(twin.measured(episode) - twin.measured(filled))
+        noise = np.array(list(twin.noise_sd.values()))
+        own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
+        at = np.clip(self._at(episode), *np.array(list(self.features.values())).T)
+        spread = np.stack([np.sum(part.root**2, axis=1) for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
+        rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
+        known = (counts > 0) & np.isfinite(left)
+        square, unmodelled, rest = left[known] ** 2, self._table(spread)(at)[known], rest[known]
+        scales = np.geomspace(0.1, 10.0, 61)
+        variance = scales[:, None] ** 2 * unmodelled + rest
+        chance = -0.5 * np.sum(np.log(variance) + square / variance, axis=1) / TOGETHER - 0.5 * np.log(scales) ** 2
+        return float(scales[np.argmax(chance)])
+
+    def _table(self, values: NDArray[np.float64]) -> RegularGridInterpolator:
+        nodes = [np.linspace(low, high, count) for count, (low, high) in zip(self._nodes, self.features.values(), strict=True)]
+        return RegularGridInterpolator(nodes, values, bounds_error=False, fill_value=None)
+
+    def _at(self, episode: Episode) -> NDArray[np.float64]:
+        """Mean features of every stretch, shape (stretches, features)."""
+        return blocks(np.stack([np.stack(_feature(episode, name), axis=1) for name in self.features], axis=2))[0]
+
+    @property
+    def _nodes(self) -> tuple[int, ...]:
+        return NODES[len(self.features)]
+
+    def _unit(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        low, high = np.array(list(self.features.values())).T
+        return np.asarray((values - low) / (high - low))
+
+    @cached_property
+    def _places(self) -> NDArray[np.float64]:
+        """Features of every stretch, scaled to 0..1, shape (n, number of features)."""
+        return self._unit(np.concatenate([self._at(episode) for episode in self.episodes]))
+
+    def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean residual of every stretch, shape (n, outputs); 0 where nothing was measured."""
+        twin = self.posterior.twin
+        out = [blocks(twin.measured(e) - twin.predict(unknowns, e.input))[0] for e in self.episodes]
+        return np.nan_to_num(np.concatenate(out), nan=0.0)
+
+    @cached_property
+    def _parts(self) -> tuple[_Part, ...]:
+        twin = self.posterior.twin
+        left = self._residuals(self.posterior.mode)
+        counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
+        lattice = np.stack(np.meshgrid(*(np.linspace(0, 1, k) for k in self._nodes), indexing="ij"), axis=-1).reshape(
+            -1, len(self.features)
+        )
+        inputs = [i for i, name in enumerate(self.features) if name in twin.model.input_names]
+        both = np.vstack([self._places, lattice])
+        low, high = np.array(list(self.features.values())).T
+        sizes = np.abs(low + both * (high - low)) / np.maximum(np.abs(low), np.abs(high))
+        weight = sizes[:, inputs].max(axis=1) ** 0.5 if inputs else np.ones(len(both))
+        return tuple(
+            _part(
+                self._places,
+                left[:, i],
+                noise**2 / np.maximum(counts[:, i], 1e-9),
+                lattice,
+                self.scale * twin.error_sd.get(name, 0.0),
+                weight,
+            )
+            for i, (name, noise) in enumerate(twin.noise_sd.items())
+        )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One output: residuals -> mean at the nodes, and a factor of the covariance at the nodes."""
+
+    gain: NDArray[np.float64]
+    root: NDArray[np.float64]
+    amplitude: float
+
+
+def _part(
+    x: NDArray[np.float64],
+    left: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    lattice: NDArray[np.float64],
+    least: float,
+    weight: NDArray[np.float64],
+) -> _Part:
+    size = float(np.sqrt(np.mean(left**2))) or 1.0
+    d = x.shape[1]
+    # In units of their prior medians all length scales have the same prior.
+    medians = np.array(LENGTH[:d])
+    kernel = MaternKernel(nu=2.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD))
+    model = SingleTaskGP(
+        torch.as_tensor(x / medians), torch.as_tensor(left[:, None] / size),
+        torch.as_tensor(np.minimum(variance / size**2, 1e6)[:, None]),
+        covar_module=ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0)), mean_module=ZeroMean(),
+        outcome_transform=None, input_transform=None,
+    )  # fmt: skip
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+    with torch.no_grad():
+        both = torch.as_tensor(np.vstack([x, lattice]) / medians)
+        whole = size**2 * model.covar_module(both).to_dense().numpy()
+        # One trajectory that the model fits says little of others.
+        whole += least**2 * kernel(both).to_dense().numpy() * np.outer(weight, weight)
+    n = len(x)
+    seen = cho_factor(whole[:n, :n] + np.diag(variance + JITTER * whole[0, 0]), lower=True)
+    gain = cho_solve(seen, whole[:n, n:]).T
+    rest = whole[n:, n:] - gain @ whole[:n, n:]
+    values, vectors = np.linalg.eigh((rest + rest.T) / 2)
+    return _Part(gain, vectors * np.sqrt(np.maximum(values, 0.0)), float(np.sqrt(whole[0, 0])))
+
+
+def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if name in episode.input_names:
+        held = episode.input[:, episode.input_names.index(name)]
+        return held, held
+    return episode.signal(name)

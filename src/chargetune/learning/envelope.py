@@ -1,0 +1,216 @@
+"""Iterative learning without a plant model: make what the controller predicts cover what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.signal import savgol_filter
+from scipy.sparse import csr_matrix, hstack, identity
+
+from chargetune.control.controller import Controller
+from chargetune.control.mpc import cached
+from chargetune.episode.episode import Episode
+from chargetune.learning.tuner import TrialLike, check_count
+from chargetune.model.parameters import ParameterSpace
+
+__all__ = ["Envelope", "EnvelopeLoop", "covering", "predicted_rows"]
+
+# What a sample that cannot be covered costs, beside the mean surplus over all samples.
+UNCOVERED = 1e4
+# What moving an entry over its whole range costs, as a share of the largest change wanted: what no sample asks for stays.
+MOVING = 1e-3
+# The rows are linearised at the theta of the episode, and once more at the first solution.
+LINEARISATIONS = 2
+# A row whose limit was never closer than this share of its own spread is not covered.
+REACH = 0.25
+
+
+class EnvelopeLoop(Protocol):
+    """A controller, and the measured counterpart of the limits that it predicts."""
+
+    @property
+    def controller(self) -> Controller: ...
+
+    def measured_rows(self, episode: Episode) -> NDArray[np.float64]:
+        """By how much each row of the controller's limits was exceeded at both ends of each interval, shape (K, 2, rows).
+
+        The rows are those of ``controller.limits`` in their order, without any backoff: what the plant did, not what the
+        controller was told. nan where nothing was measured, or where the row says nothing of the plant.
+        """
+        ...
+
+    @property
+    def row_tolerances(self) -> NDArray[np.float64]:
+        """The excess of each row that is still called kept, shape (rows,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """Iterative learning: the theta whose predictions cover what was measured last, filtered and damped. No model of the plant.
+
+    Per sample the error of the controller's prediction, e_k - c_k at the newest trace, is smoothed (Savitzky-Golay, order 2) and
+    covered in full where it asks for caution, by the share ``relax`` where it allows more. First theta_0, or ``start``.
+    Quick, and without a promise: it does not know what it has not seen. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
+    """
+
+    loop: EnvelopeLoop
+    relax: float = 0.7
+    window: int = 21
+    start: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.relax, bool) or not 0.0 < self.relax <= 1.0:
+            raise ValueError(f"envelope: relax = {self.relax!r}, allowed is (0, 1]")
+        if isinstance(self.window, bool) or not isinstance(self.window, int) or self.window < 3:
+            raise ValueError(f"envelope: window = {self.window!r}, allowed is an integer >= 3")
+
+    def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
+        """The next theta, ``n`` times: a step needs the trial before it. Shape (n, d)."""
+        check_count(n)
+        first = space.default if self.start is None else space.validate(np.array(self.start))
+        for trial in reversed(trials):
+            reader = getattr(trial, "episode", None)
+            episode = None if reader is None else reader()
+            if episode is not None and len(episode) > 1:
+                first = self._step(np.array(trial.theta), episode)
+                break
+        return np.tile(first, (n, 1))
+
+    def _step(self, theta: NDArray[np.float64], episode: Episode) -> NDArray[np.float64]:
+        controller = self.loop.controller
+        predicted, _ = predicted_rows(controller, episode, theta)
+        error = _smooth(self.loop.measured_rows(episode) - predicted, self.window)
+        wanted = predicted + np.where(error < 0, self.relax * error, error)
+        return covering(controller, episode, theta, wanted)
+
+
+def _smooth(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Along the first axis; what is not finite stays so and is bridged."""
+    out, at = np.full_like(values, np.nan), np.arange(len(values))
+    length = min(window, len(values))
+    for index in np.ndindex(*values.shape[1:]):
+        column = values[(slice(None), *index)]
+        known = np.isfinite(column)
+        if known.any():
+            bridged = np.interp(at, at[known], column[known])
+            smooth = savgol_filter(bridged, length, 2) if length > 2 else bridged
+            out[(slice(None), *index)] = np.where(known, smooth, np.nan)
+    return out
+
+
+def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The controller's own prediction of its limits' rows one interval ahead, along a recorded episode, if its theta had been ``theta``.
+
+    Rows at both ends of each interval, shape (K, 2, rows), and their slopes with respect to theta, shape (K, 2, rows, d): the
+    estimator is run again along the recorded inputs and outputs, its state's sensitivity with it. nan where a limit does not
+    apply at that end.
+    """
+    memory = controller.estimator.initial(controller.model, np.array(controller.start))
+    step = cached(f"rows {controller.structure}", lambda: _step(controller))
+    names = controller.estimator.signals(controller.model)
+    received = np.full((len(episode), len(names)), np.nan)
+    for i, name in enumerate(names):
+        start, end = episode.signal(name)
+        received[1:, i] = end[:-1]
+        # A state is the same on both sides of the input's first jump, an output is not.
+        if name in controller.model.state_names:
+            received[0, i] = start[0]
+    last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
+    d, count = len(theta), len(episode)
+    roll = cached(f"rolled rows {controller.structure} {count}", lambda: step.mapaccum("rolled", count, 2))
+    fixed = [np.tile(np.asarray(v)[:, None], (1, count)) for v in (theta, controller.model.nominal)]
+    _, _, rows, slopes = roll(memory, np.zeros((memory.size, d)), received.T, last.T, episode.input.T, *fixed)
+    width = rows.shape[0] // 2
+    return np.array(rows).T.reshape(count, 2, width), np.array(slopes).T.reshape(count, d, 2, width).transpose(0, 2, 3, 1)
+
+
+def covering(
+    controller: Controller,
+    episode: Episode,
+    theta: NDArray[np.float64],
+    measured: NDArray[np.float64],
+    margin: float | NDArray[np.float64] = 0.0,
+) -> NDArray[np.float64]:
+    """The theta with which the controller's predictions cover what was measured on this episode, and not much more.
+
+        min   mean_k c_k(theta') + UNCOVERED mean_k t_k + moving sum_i |theta'_i - theta_i| / range_i
+        s.t.  c_k(theta') >= e_k + margin - t_k,  t_k >= 0,  theta' in its bounds
+
+    c: predicted rows, linear in theta' around ``theta``; e: ``measured`` rows. A controller that keeps its limits with such a
+    theta keeps them on the plant wherever it was measured, and rides them. A linear program (HiGHS).
+    Raises ValueError when there is nothing to cover.
+    """
+    lower, upper = controller.theta.lower, controller.theta.upper
+    near = _near(controller, measured)
+    for _ in range(LINEARISATIONS):
+        rows, slopes = predicted_rows(controller, episode, theta)
+        wanted = np.where(near, measured + margin - rows, np.nan).ravel()
+        steep = slopes.reshape(wanted.size, -1)
+        known = np.isfinite(wanted) & np.all(np.isfinite(steep), axis=1)
+        if not known.any():
+            raise ValueError("nothing to cover: no measured row is finite")
+        n, d = int(known.sum()), len(theta)
+        moved = steep[known]
+        moving = MOVING * float(np.max(np.abs(wanted[known]))) / (upper - lower)
+        # theta' - theta as the difference of two numbers >= 0, so that its size is linear too.
+        cost = np.concatenate([moved.mean(axis=0) + moving, -moved.mean(axis=0) + moving, np.full(n, UNCOVERED / n)])
+        matrix = hstack([csr_matrix(-moved), csr_matrix(moved), -identity(n)]).tocsc()
+        most = np.concatenate([np.maximum(upper - theta, 0.0), np.maximum(theta - lower, 0.0), np.full(n, np.inf)])
+        found = linprog(cost, A_ub=matrix, b_ub=-wanted[known], bounds=np.stack([np.zeros_like(most), most], axis=1), method="highs")
+        if found.x is None:
+            return theta
+        theta = np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
+    return np.asarray(theta, dtype=np.float64)
+
+
+def _near(controller: Controller, measured: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which rows are to be covered: of each limit the closer side, because the other one asks for the opposite."""
+    if not np.any(np.isfinite(measured)):
+        raise ValueError("nothing to cover: no measured row is finite")
+    flat = np.where(np.isfinite(measured), measured, -np.inf).reshape(-1, measured.shape[-1])
+    most, least = flat.max(axis=0), np.where(np.isfinite(flat), flat, np.inf).min(axis=0)
+    closeness = np.where(np.isfinite(most), most / np.maximum(np.where(np.isfinite(most), most - least, 1.0), 1e-12), -np.inf)
+    out, first = closeness >= min(-REACH, float(closeness.max())), 0
+    for limit in controller.limits:
+        part = slice(first, first + limit.rows.size1_out(0))
+        out[part] &= np.arange(part.stop - part.start) == np.argmax(closeness[part])
+        first = part.stop
+    return out
+
+
+def _step(controller: Controller) -> ca.Function:
+    """(memory, its slopes, received, last input, input, theta, p) -> (memory, its slopes, rows, their slopes) one interval ahead."""
+    model, estimator = controller.model, controller.estimator
+    names = estimator.signals(model)
+    nm, d = estimator.initial(model, np.array(controller.start)).size, controller.theta.dimension
+    memory, theta = ca.SX.sym("memory", nm), ca.SX.sym("theta", d)
+    received, nominal = ca.SX.sym("received", len(names)), ca.SX.sym("p", model.nominal.size)
+    slopes = ca.SX.sym("slopes", nm, d)
+    last, u = (ca.SX.sym(n, len(model.inputs)) for n in ("last", "u"))
+    p = controller.parameters(theta, nominal)
+    signals = {name: received[i] for i, name in enumerate(names)}
+    estimate, corrected = estimator.correct(model, memory, signals, last, p)
+    ahead = ca.SX(estimator.predict(model, estimate, corrected, u, p))
+    rows: list[Any] = []
+    for end, state in (("start", estimate), ("end", model.f(estimate, u, p))):
+        for limit in controller.limits:
+            row = limit.rows(state, u, theta, p, estimate)
+            applies = limit.at in (end, "both")
+            rows.append(row if applies else ca.SX.nan(*row.shape))
+    every = ca.vertcat(*rows)
+
+    def total(value: Any) -> Any:
+        return ca.densify(ca.jacobian(value, theta) + ca.mtimes(ca.jacobian(value, memory), slopes))
+
+    return ca.Function(
+        "rows",
+        [memory, slopes, received, last, u, theta, nominal],
+        ca.cse([ca.densify(ahead), total(ahead), ca.densify(every), ca.vec(total(every))]),
+    )

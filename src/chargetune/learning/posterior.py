@@ -1,0 +1,114 @@
+"""The posterior of a twin's unknowns: predicted with, and drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from chargetune.learning.twin import Twin
+
+__all__ = ["Posterior"]
+
+# Steps by which a draw is brought to what it should predict, and twice the loss of log-likelihood at which it is there.
+CHORDS, MISFIT = 6, 9.0
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """m ~ N(mode, root root') for the unknowns of ``twin``, and the standard deviation of what the model cannot represent, per output.
+
+    ``spread`` is the standard deviation of a sample in the likelihood, ``seen`` the inputs of each episode and which of its
+    samples were measured.
+    """
+
+    twin: Twin
+    mode: NDArray[np.float64]
+    root: NDArray[np.float64]
+    discrepancy_sd: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    seen: tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...] = ()
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        return self.root @ self.root.T
+
+    def draw(self, count: int, seed: int) -> NDArray[np.float64]:
+        """Unknowns of ``count`` plants that the data allow, shape (count, d).
+
+        A Gaussian draw of two resistances in series whose sum alone is known misses the sum, because it is not linear in their
+        logarithms. So each draw m' is moved to where what it predicts is what it would predict if the model were linear:
+
+            min over m  |y(m) - y(mode) - J (m' - mode)|^2 + |m - m'|^2
+
+        in the metrics of likelihood and prior, J the slopes at the mode (randomise, then optimise; Bardsley et al., SIAM J. Sci.
+        Comput. 36 (2014) A1895): steps with the mode's slopes, with its own where these do not lead there. A draw that
+        neither brings below `MISFIT` is halved towards the mode.
+        """
+        normal = np.random.default_rng(seed).standard_normal((count, self.root.shape[1]))
+        drawn = normal @ self.root.T
+        if not self.seen:
+            return np.asarray(self.mode + drawn, dtype=np.float64)
+        return np.array([self._moved(draw) for draw in drawn])
+
+    def _moved(self, draw: NDArray[np.float64]) -> NDArray[np.float64]:
+        for fresh in (False, True, True):
+            m = self.mode + draw
+            misfit, pull = self._misfit(m, draw)
+            for _ in range(CHORDS):
+                step = np.linalg.solve(self._curvature(m), pull) if fresh else self.root @ (self.root.T @ pull)
+                shares = (1.0, 0.5, 0.25) if fresh else (1.0,)
+                for share in shares:
+                    ahead = m - share * step
+                    other, following = self._misfit(ahead, draw)
+                    if other < misfit:
+                        break
+                else:
+                    break
+                m, misfit, pull, gain = ahead, other, following, misfit - other
+                if gain < 0.05:
+                    break
+            if misfit < MISFIT:
+                return m
+            draw = draw * (0.5 if fresh else 1.0)
+        return self.mode + draw
+
+    @cached_property
+    def _at_mode(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        return [(self.twin.predict(self.mode, u), self.twin.slopes(self.mode, u)) for u, _ in self.seen]
+
+    @cached_property
+    def _precision(self) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.inv(self.twin.prior_factor @ self.twin.prior_factor.T))
+
+    def _misfit(self, m: NDArray[np.float64], draw: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """What `draw` minimises at m, and half its gradient with the slopes of the mode."""
+        away = m - self.mode - draw
+        pull = self._precision @ away
+        total = float(away @ pull)
+        for (u, seen), (values, slopes) in zip(self.seen, self._at_mode, strict=True):
+            left = np.where(seen, self.twin.predict(m, u) - values - slopes @ draw, 0.0) / self.spread
+            total += float(np.sum(left**2))
+            pull = pull + (left / self.spread).ravel() @ slopes.reshape(-1, draw.size)
+        return total, pull
+
+    def _curvature(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """J'J of the whitened residuals at m, in the metric of the slopes that `_misfit` pulls with."""
+        total = self._precision.copy()
+        for (u, seen), (_, at_mode) in zip(self.seen, self._at_mode, strict=True):
+            weight = np.where(seen, 1.0, 0.0) / self.spread**2
+            own = self.twin.slopes(m, u).reshape(-1, m.size)
+            total += (at_mode.reshape(-1, m.size) * weight.reshape(-1, 1)).T @ own
+        return total
+
+    def predicted_sd(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of a new noisy sample of each measured output under ``inputs``, shape (K, 2, outputs): by linearisation."""
+        twin = self.twin
+        slopes = twin.slopes(self.mode, inputs)
+        noise = np.array(list(twin.noise_sd.values()))
+        variance = np.sum((slopes @ self.root) ** 2, axis=-1) + self.discrepancy_sd**2 + noise**2
+        return np.asarray(np.sqrt(variance), dtype=np.float64)

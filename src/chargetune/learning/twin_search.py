@@ -1,0 +1,121 @@
+"""The best theta on one simulated plant: envelope steps to come near, SLSQP on objective and excess to arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from chargetune.episode.score import Score
+from chargetune.learning.belief import Simulate, TwinLoop, windows_of
+from chargetune.learning.envelope import covering
+from chargetune.model.parameters import ParameterSpace
+
+__all__ = ["Search"]
+
+# Objective and excess are scaled to their spread over the pool, so that one step and one penalty fit any problem.
+PENALTY = 10.0
+# Of a limit's tolerance: what the search aims at, and what it accepts, since SLSQP ends a little on the wrong side. The rest
+# is left to noise and to what the twin does not know.
+AIMED, ACCEPTED = 0.25, 0.75
+STEP = 2e-3
+# Far inside a limit its excess says nothing: windows are cut here, in scaled units.
+FAR = -1.0
+
+
+class Search:
+    """Verdicts on the episodes of one plant by point of the unit cube, remembered."""
+
+    def __init__(self, loop: TwinLoop, simulate: Simulate, space: ParameterSpace) -> None:
+        self._loop, self._simulate, self._space = loop, simulate, space
+        self._seen: dict[bytes, Score | None] = {}
+        self._slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._unit = (1.0, 1.0)
+
+    def score(self, u: NDArray[np.float64]) -> Score | None:
+        key = u.tobytes()
+        if key not in self._seen:
+            episode = self._simulate(self._space.from_unit(np.clip(u, 0.0, 1.0)))
+            self._seen[key] = None if episode is None else self._loop.score(episode)
+        return self._seen[key]
+
+    def envelope(self, start: NDArray[np.float64], iterations: int) -> None:
+        """From ``start``, ``iterations`` times the theta whose predictions cover what the plant did last; all are remembered."""
+        theta = self._space.from_unit(start)
+        for _ in range(iterations):
+            episode = self._simulate(theta)
+            if episode is None:
+                return
+            theta = covering(self._loop.controller, episode, theta, self._loop.measured_rows(episode))
+            self.score(self._space.to_unit(theta))
+
+    def scale(self, points: Sequence[NDArray[np.float64]]) -> None:
+        """Take the units from the spread over these points."""
+        scores = [s for u in points if (s := self.score(u)) is not None]
+        objective = [s.objective for s in scores]
+        excess = [float(np.nanmax(windows_of(s, AIMED), initial=0.0)) for s in scores]
+        self._unit = (float(np.ptp(objective)) or 1.0 if objective else 1.0, max(excess, default=0.0) or 1.0)
+
+    def refine(self, start: NDArray[np.float64], iterations: int) -> None:
+        """SLSQP with finite differences of ``STEP``; every point it visits is remembered."""
+        if self.score(start) is None:
+            return
+        constraint: dict[str, Any] = {
+            "type": "ineq",
+            "fun": lambda u: -np.maximum(self._values(u)[1], FAR),
+            "jac": lambda u: -self._derivatives(u)[1],
+        }
+        minimize(
+            lambda u: self._values(u)[0],
+            start,
+            jac=lambda u: self._derivatives(u)[0],
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * start.size,
+            constraints=[constraint],
+            options={"maxiter": iterations, "ftol": 1e-6},
+        )
+
+    def merit(self, u: NDArray[np.float64]) -> float:
+        value, excess = self._values(u)
+        return float(value + PENALTY * np.sum(np.maximum(excess, 0.0)))
+
+    def best(self) -> NDArray[np.float64]:
+        """The seen point of the best objective that keeps the limits, else that of the least worst excess."""
+
+        def rank(key: bytes) -> tuple[bool, float]:
+            score = self._seen[key]
+            if score is None:
+                return True, np.inf
+            worst = float(np.nanmax(windows_of(score, ACCEPTED), initial=-np.inf))
+            return worst > 0, -score.objective if worst <= 0 else worst
+
+        return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
+
+    def _values(self, u: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """(objective to be minimised, excess beyond what is aimed at, of every window; -inf where none was visited), scaled."""
+        score = self.score(u)
+        if score is None:
+            return np.inf, np.zeros(0)
+        excess = windows_of(score, AIMED)
+        return -score.objective / self._unit[0], np.where(np.isfinite(excess), excess, -np.inf) / self._unit[1]
+
+    def _derivatives(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        key = u.tobytes()
+        if key not in self._slopes:
+            value, excess = self._values(u)
+            gradient, jacobian = np.zeros(u.size), np.zeros((excess.size, u.size))
+            for i in range(u.size):
+                step = STEP if u[i] + STEP <= 1.0 else -STEP
+                ahead = u.copy()
+                ahead[i] += step
+                other, beyond = self._values(ahead)
+                if np.isfinite(other) and beyond.shape == excess.shape:
+                    gradient[i] = (other - value) / step
+                    both = np.isfinite(excess) & np.isfinite(beyond)
+                    jacobian[both, i] = (beyond[both] - excess[both]) / step
+            jacobian[excess <= FAR] = 0.0
+            self._slopes[key] = gradient, jacobian
+        return self._slopes[key]
