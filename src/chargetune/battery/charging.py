@@ -21,7 +21,7 @@ from chargetune.control.controller import Controller, SoftLimit, Stage
 from chargetune.control.estimators import Estimator, ExactState, Propagated
 from chargetune.control.mpc import compiled_act
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
-from chargetune.episode.episode import Ending, Episode
+from chargetune.episode.episode import Ending, Episode, Trip
 from chargetune.episode.score import Score
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.parameters import ParameterSpace
@@ -33,6 +33,10 @@ __all__ = ["Backoff", "ChargingProblem", "PlantModel", "ResistanceRatio"]
 
 # A violation of a limit that is noticed, in its unit: the solver's tolerance is relative to it.
 NOTICED = {"voltage": 0.1, "temperature": 1.0, "anode": 0.01}
+
+
+# The largest of some hundred means is that many standard deviations above the truth.
+NOISE_SD = 3.0
 
 
 class PlantModel(Protocol):
@@ -55,7 +59,10 @@ class ChargingProblem:
     Objective of the paper: G = -sum_{k=0..K} c1 (z_d - z_k)^2 - sum_{k<K} max(0, V_k - v_max)^2, V_k the larger of the
     voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; each limit
     is scored on its own, upper voltage, temperature and anode potential also in ``soc_windows`` equal parts of the SOC,
-    and as moving mean over ``verdict_samples`` intervals where the signal's sensor has noise.
+    and as moving mean over ``verdict_samples`` intervals where the signal's sensor has noise: then three standard deviations of
+    that mean belong to the tolerance, since they are no violation that was seen.
+    ``abort_margin_V`` and ``abort_margin_K`` end an episode as soon as a measured voltage or temperature is so far beyond its
+    upper limit: the plant is closed, its current is 0, the trial failed and its trace is kept.
     Limits that the controller's model predicts are kept by it softly; ``hard`` and ``scored_only`` name the exceptions.
     """
 
@@ -91,6 +98,8 @@ class ChargingProblem:
     current_limit: CurrentLimit | None = None
     limit_backoffs: tuple[LimitBackoff, ...] = ()
     voltage_spread: MeasurementSpread | None = None
+    abort_margin_V: float | None = None
+    abort_margin_K: float | None = None
 
     def __post_init__(self) -> None:
         cell = self.plant_cell
@@ -107,6 +116,9 @@ class ChargingProblem:
         check_number("penalty_per_V", self.penalty_per_V, 0.0, 1e9, "", open_low=True)
         check_number("c1", self.c1, 0.0, 1.0, "", open_low=True)
         check_number("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")
+        for name, largest, unit in (("abort_margin_V", 1.0, "V"), ("abort_margin_K", 50.0, "K")):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), 0.0, largest, unit, open_low=True)
         for name, count in (("steps", 1_000_000), ("horizon", 50), ("soc_windows", 50), ("verdict_samples", 1000)):
             check_count(name, getattr(self, name), 1, count)
         seed = self.mismatch_seed
@@ -299,9 +311,19 @@ class ChargingProblem:
     def episode(self, theta: ArrayLike | None = None, seed: int = 0) -> Episode:
         """One charge with the controller at theta (None: untuned)."""
         if self._episodes is not None:
-            return self._episodes.run(theta, seed)
+            return self._episodes.run(theta, seed, self.trips)
         control = compiled_act(self.controller)
-        return run_episode(self.controller, self.plant, steps=self.steps, theta=theta, seed=seed, control=control)
+        return run_episode(self.controller, self.plant, steps=self.steps, theta=theta, seed=seed, trips=self.trips, control=control)
+
+    @property
+    def trips(self) -> tuple[Trip, ...]:
+        """What ends an episode at once, whatever the controller does."""
+        out = []
+        for limit in self.limits:
+            margin = {"voltage_max_V": self.abort_margin_V, "temperature_max_K": self.abort_margin_K}.get(limit.name)
+            if margin is not None:
+                out.append(Trip(limit.signal, upper=limit.bound + margin))
+        return tuple(out)
 
     @cached_property
     def _episodes(self) -> CompiledEpisode | None:
@@ -316,8 +338,7 @@ class ChargingProblem:
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
             raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        noisy = {limit.name: self.sensors.noise_sd.get(limit.signal, 0.0) > 0 for limit in self.limits}
-        excess = {limit.name: limit.excess(episode, self.verdict_samples if noisy[limit.name] else 1) for limit in self.limits}
+        excess = {limit.name: limit.excess(episode, self._judged(limit)[0]) for limit in self.limits}
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
         # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
@@ -329,16 +350,22 @@ class ChargingProblem:
             objective=-float(np.mean(deficit)),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
             excess={name: float(np.max(values)) for name, values in excess.items()},
-            tolerance={limit.name: limit.tolerance for limit in self.limits},
+            tolerance={limit.name: self._judged(limit)[1] for limit in self.limits},
             metrics=metrics,
             profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
         )
 
+    def _judged(self, limit: Limit) -> tuple[int, float]:
+        """(intervals of the moving mean, excess still called kept): of a noisy signal what `NOISE_SD` sd of that mean may be."""
+        noise = self.sensors.noise_sd.get(limit.signal, 0.0)
+        samples = self.verdict_samples if noise > 0 else 1
+        return samples, limit.tolerance + NOISE_SD * noise / samples**0.5
+
     def violation_mVs(self, episode: Episode) -> float:
         """Excess of the upper voltage limit beyond its tolerance, in the moving mean of the verdict, over time, mV s."""
         limit = self.limits[0]
-        samples = self.verdict_samples if self.sensors.noise_sd.get(limit.signal, 0.0) > 0 else 1
-        beyond = np.maximum(0.0, np.nan_to_num(limit.excess(episode, samples)) - limit.tolerance)
+        samples, tolerance = self._judged(limit)
+        beyond = np.maximum(0.0, np.nan_to_num(limit.excess(episode, samples)) - tolerance)
         return float(1e3 * episode.sampling_time_s * np.sum(beyond))
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:

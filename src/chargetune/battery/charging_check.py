@@ -37,6 +37,7 @@ def stand_in(problem: ChargingProblem) -> ChargingProblem:
 
     Limits of signals that the circuit does not have are left out.
     """
+    problem = replace(problem, abort_margin_V=None, abort_margin_K=None)
     if problem.plant_model is None:
         return replace(problem, sensors=Sensors(), verdict_samples=1)
     cell = problem.plant_cell

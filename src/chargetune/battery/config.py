@@ -24,7 +24,7 @@ from chargetune.plants.sensors import Sensors
 __all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "problem_of_document"]
 
 
-TunerName = Literal["default", "ei", "sobol", "twin"]
+TunerName = Literal["default", "ei", "sobol", "twin", "envelope"]
 RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
 
@@ -196,6 +196,19 @@ class ThetaTable(_Table):
     values: dict[str, float | list[float]] = Field(default_factory=dict)
 
 
+class SafetyTable(_Table):
+    """Safe learning by the twin: what must be likely, where to begin, what may be spent, when an episode is ended.
+
+    ``start`` holds values of theta by name, like [theta.values]; without it the most cautious corner is the start.
+    """
+
+    probability: float = 0.95
+    start: dict[str, float | list[float]] | None = None
+    budget_mVs: float | None = None
+    abort_margin_V: float | None = 0.02
+    abort_margin_K: float | None = 2.0
+
+
 class Config(_Table):
     """The whole file; every table may be left out."""
 
@@ -209,6 +222,7 @@ class Config(_Table):
     sensors: SensorTable = SensorTable()
     objective: ObjectiveTable = ObjectiveTable()
     theta: ThetaTable = ThetaTable()
+    safety: SafetyTable | None = None
 
     def problem(self, folder: Path | None = None, *, cell: Cell | None = None) -> ChargingProblem:
         """The charging problem; a relative cell file is looked for in ``folder``, ``cell`` stands in for the file's.
@@ -242,6 +256,8 @@ class Config(_Table):
             sensors=sensors,
             hard=tuple(self.limits.hard),
             scored_only=tuple(self.limits.scored_only),
+            abort_margin_V=self.safety.abort_margin_V if self.safety else None,
+            abort_margin_K=self.safety.abort_margin_K if self.safety else None,
             **self.objective.model_dump(),
             **self.controller.model_dump(),
             **self.limits.model_dump(exclude={"hard", "scored_only"}),
@@ -252,6 +268,11 @@ class Config(_Table):
         """theta as the file gives it; what it does not name is untuned."""
         return problem.space.from_dict(dict(self.theta.values))
 
+    def safe_start(self, problem: ChargingProblem) -> NDArray[np.float64] | None:
+        """The theta that the file declares safe."""
+        start = self.safety.start if self.safety else None
+        return None if start is None else problem.space.from_dict(dict(start))
+
     def document(self, folder: Path | None = None) -> dict[str, Any]:
         """What decides the trials, as JSON data for the store: the cell's numbers instead of its file, without the number of trials."""
         data = self.model_dump(mode="json")
@@ -259,6 +280,8 @@ class Config(_Table):
         data["cell"] = json.loads(json.dumps(asdict(cell)))
         data["theta"].pop("values")
         data["study"] = {"tuner": self.study.tuner}
+        if self.safety is None:
+            del data["safety"]
         return data
 
     def _cell(self, folder: Path | None) -> Cell:

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.claims import SeedRun, decide
-from chargetune.battery.config import CASE_STUDIES, Config, TunerName, case_study, problem_of_document
+from chargetune.battery.config import CASE_STUDIES, Config, SafetyTable, TunerName, case_study, problem_of_document
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.episode import Episode
 from chargetune.study.store import Store
@@ -28,16 +29,26 @@ ATTAINABLE_T95_MIN: dict[str, tuple[float, ...]] = {
 }
 
 
-def make_tuner(name: TunerName, seed: int, problem: ChargingProblem) -> Proposer:
-    """The tuner that a configuration names; the twin simulates the problem's controller."""
+def make_tuner(
+    name: TunerName, seed: int, problem: ChargingProblem, safety: SafetyTable | None = None, start: NDArray[np.float64] | None = None
+) -> Proposer:
+    """The tuner that a configuration names; the twin simulates the problem's controller.
+
+    Raises ValueError when it is to be safe and cannot.
+    """
+    if safety and name != "twin":
+        raise ValueError(f"[safety] is given with tuner = {name!r}, allowed is tuner = 'twin': it alone predicts what it has not tried")
     # torch is needed from here on only.
     from chargetune import learning
 
+    first = None if start is None else tuple(float(v) for v in start)
+    safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
     makers: dict[str, Callable[[int], Proposer]] = {
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
         "sobol": lambda s: learning.Sobol(seed=s),
-        "twin": lambda s: learning.TwinTuner(ChargingTwin(problem), seed=s),
+        "envelope": lambda _: learning.Envelope(ChargingTwin(problem)),
+        "twin": lambda s: learning.TwinTuner(ChargingTwin(problem), seed=s, safety=safe),
     }
     return makers[name](seed)
 
@@ -50,7 +61,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None) -> Stud
         config.study.name,
         config=config.document(folder),
         space=problem.space,
-        tuner=make_tuner(config.study.tuner, config.study.seed, problem),
+        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem)),
         seed=config.study.seed,
         batch=config.study.batch,
     )

@@ -108,6 +108,8 @@ class ChargingTwin:
         return replace(
             problem,
             plant_model=None,
+            abort_margin_V=None,
+            abort_margin_K=None,
             soc_windows=WINDOWS,
             verdict_samples=1,
             sensors=Sensors(),

@@ -38,6 +38,7 @@ class TunerChoice(StrEnum):
     EI = "ei"
     SOBOL = "sobol"
     TWIN = "twin"
+    ENVELOPE = "envelope"
 
 
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
@@ -138,7 +139,7 @@ def reproduce(
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
     trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
     tuner: Annotated[
-        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, Sobol points, or the twin.")
+        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, Sobol points, the twin, or envelope steps.")
     ] = TunerChoice.DEFAULT,
     workers: Workers = 2,
     out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging import ChargingProblem
@@ -15,8 +21,10 @@ from chargetune.battery.config import Config, load_config
 from chargetune.battery.reproduce import open_study, tuned_trial
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, theta_lines
+from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
+from chargetune.study.study import Study
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["bar", "tune_command"]
@@ -57,17 +65,44 @@ def tune_command(
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
-    _check(problem, force=force)
+    _check(problem, config.safe_start(problem), force=force)
+    everything, safety = _run(config, path.parent, problem, kept, count, workers, quiet=as_json)
+    best = tuned_trial(everything, config.study.tuner)
+    figures: list[Path] = []
+    if out is not None:
+        from chargetune.report import save_figures
 
+        figures = save_figures(kept, config.study.name, out, trials=count)
+    summary = _summary(config, everything, best, problem.space.entries)
+    summary |= {"safety": safety} if safety else {}
+    if out is not None:
+        (out / "summary.json").write_text(json.dumps(summary, indent=1))
+    if as_json:
+        print(json.dumps(summary))  # noqa: T201
+        _end(safety)
+        return
+    _closing(problem, everything, best)
+    if safety:
+        budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
+        spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
+        console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
+    console().print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+    _end(safety)
+
+
+def _run(
+    config: Config, folder: Path, problem: ChargingProblem, kept: Path, count: int, workers: int, *, quiet: bool
+) -> tuple[list[Trial], dict[str, Any] | None]:
+    """The trials of the study, and what there is to say of safety."""
     with ExitStack() as stack:
         opened = stack.enter_context(Store(kept))
-        study = stack.enter_context(open_study(opened, config, path.parent))
+        study = stack.enter_context(open_study(opened, config, folder))
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
-        progress = stack.enter_context(bar(quiet=as_json))
+        progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
-        if done and not as_json:
+        if done and not quiet:
             progress.console.print(f"resumed: {done} trials are in {kept}")
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
@@ -76,27 +111,58 @@ def tune_command(
                 best = f"best t95 {number(incumbent.score.metrics.get('t95_min'))} min (trial {incumbent.number})"
             progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
 
-        study.run(problem, count, executor=executor, progress=note)
+        stack.enter_context(_said(progress.console))
+        # A tuner has loaded this folder by now.
+        from chargetune.learning import NoSafeThetaError
+
+        stopped = ""
+        try:
+            study.run(problem, count, executor=executor, progress=note)
+        except NoSafeThetaError as error:
+            stopped = str(error)
         everything = study.trials()[:count]
-
-    best = tuned_trial(everything, config.study.tuner)
-    figures: list[Path] = []
-    if out is not None:
-        from chargetune.report import save_figures
-
-        figures = save_figures(kept, config.study.name, out, trials=count)
-    summary = _summary(config, everything, best, problem.space.entries)
-    if out is not None:
-        (out / "summary.json").write_text(json.dumps(summary, indent=1))
-    if as_json:
-        print(json.dumps(summary))  # noqa: T201
-        return
-    _closing(problem, everything, best)
-    console().print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+        safety = _safety(config, problem, study, everything, stopped)
+    return everything, safety
 
 
-def _check(problem: ChargingProblem, *, force: bool) -> None:
-    findings = check_charging(problem, quick=True)
+@contextmanager
+def _said(screen: Console) -> Iterator[None]:
+    """Warnings of a tuner as lines above the progress bar."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RuntimeWarning)
+        warnings.showwarning = lambda message, *_, **__: screen.print(f"[yellow]{escape(str(message))}[/]")
+        yield
+
+
+def _end(safety: dict[str, Any] | None) -> None:
+    if safety and safety["stopped"]:
+        raise ValueError(f"stopped before the last trial: {safety['stopped']}")
+
+
+def _safety(config: Config, problem: ChargingProblem, study: Study, trials: Sequence[Trial], stopped: str) -> dict[str, Any] | None:
+    """What safe learning stated and spent; an episode that was ended at a limit counts with its trace."""
+    table = config.safety
+    if table is None:
+        return None
+    spent, ended = 0.0, 0
+    for trial in trials:
+        if trial.score is not None:
+            spent += trial.score.metrics.get("violation_mVs") or 0.0
+        elif trial.status is TrialStatus.FAILED:
+            episode = study.episode(trial.number)
+            spent += problem.violation_mVs(episode) if episode is not None and len(episode) else 0.0
+            ended += (trial.ending or "").startswith(Ending.LIMIT.value)
+    return {
+        "probability": table.probability,
+        "violation_mVs": spent,
+        "budget_mVs": table.budget_mVs,
+        "ended_at_a_limit": ended,
+        "stopped": stopped or None,
+    }
+
+
+def _check(problem: ChargingProblem, start: NDArray[np.float64] | None, *, force: bool) -> None:
+    findings = check_charging(problem, start=start, quick=True)
     print_findings(findings, console(stderr=True))
     if not force and any(finding.severity == "error" for finding in findings):
         raise ValueError("the formulation has an error; `chargetune check` shows it, --force tunes nevertheless")
@@ -109,8 +175,10 @@ def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | No
     screen.print(f"\n[bold]{problem.plant_cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
     if problem.plant_cell.remark:
         screen.print(f"[dim]{problem.plant_cell.remark}[/]")
-    untuned = everything[0].score if everything else None
-    screen.print(metrics_table({"untuned": untuned, "tuned": best.score if best else None}, problem))
+    first = everything[0].score if everything else None
+    # A safe study does not begin with the untuned controller.
+    label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"
+    screen.print(metrics_table({label: first, "tuned": best.score if best else None}, problem))
     if best is None or not best.feasible:
         screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
     if best is not None:

@@ -122,11 +122,9 @@ class Prediction:
         rows = [windows_of(score) for score in scores if score is not None]
         return np.array(rows).reshape(len(rows), -1)
 
-    def probability(self, inflation: float = 1.0) -> float:
-        """Share of the plants that keep every limit within its tolerance; deviations from the median are multiplied by ``inflation``."""
-        if not len(self.excess):
-            return 0.0
-        kept = np.all(~(self._inflated(inflation) > 0), axis=1)
+    def probability(self) -> float:
+        """Share of the plants that keep every limit within its tolerance."""
+        kept = np.all(~(self.excess > 0), axis=1)
         return float(np.sum(kept) / len(self.episodes))
 
     def upper_rows(self, deviations: float) -> NDArray[np.float64] | None:
@@ -138,11 +136,14 @@ class Prediction:
         whole = np.array([r for r in rows if len(r) == longest])
         return np.asarray(whole.mean(axis=0) + deviations * whole.std(axis=0))
 
-    def _inflated(self, inflation: float) -> NDArray[np.float64]:
-        if inflation == 1.0:
-            return self.excess
-        middle = np.nanmedian(self.excess, axis=0)
-        return np.asarray(middle + inflation * (self.excess - middle))
+    def upper_windows(self, deviations: float) -> NDArray[np.float64]:
+        """mean + ``deviations`` sd of the excess by window; nan where hardly a plant was."""
+        known = np.isfinite(self.excess)
+        count = known.sum(axis=0)
+        values = np.where(known, self.excess, 0.0)
+        mean = values.sum(axis=0) / np.maximum(count, 1)
+        sd = np.sqrt(np.where(known, (values - mean) ** 2, 0.0).sum(axis=0) / np.maximum(count, 1))
+        return np.where(2 * count > len(self.excess), mean + deviations * sd, np.nan)
 
 
 def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:

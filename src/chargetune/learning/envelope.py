@@ -29,6 +29,8 @@ MOVING = 1e-3
 LINEARISATIONS = 2
 # A row whose limit was never closer than this share of its own spread is not covered.
 REACH = 0.25
+# An input within this share of its range is at its bound.
+AT_BOUND = 1e-3
 
 
 class EnvelopeLoop(Protocol):
@@ -143,27 +145,37 @@ def covering(
         min   mean_k c_k(theta') + UNCOVERED mean_k t_k + moving sum_i |theta'_i - theta_i| / range_i
         s.t.  c_k(theta') >= e_k + margin - t_k,  t_k >= 0,  theta' in its bounds
 
+    In an interval whose input was at its bound, and which kept the limit nevertheless, only max(0, c_k(theta')) counts.
+
     c: predicted rows, linear in theta' around ``theta``; e: ``measured`` rows. A controller that keeps its limits with such a
     theta keeps them on the plant wherever it was measured, and rides them. A linear program (HiGHS).
     Raises ValueError when there is nothing to cover.
     """
     lower, upper = controller.theta.lower, controller.theta.upper
-    near = _near(controller, measured)
+    near, full = _near(controller, measured), _at_bound(controller, episode, theta)
     for _ in range(LINEARISATIONS):
         rows, slopes = predicted_rows(controller, episode, theta)
-        wanted = np.where(near, measured + margin - rows, np.nan).ravel()
+        beyond = measured + margin
+        # Where the input is at its bound the limit does not decide it: there the prediction only has to stay below.
+        idle = full[:, None, None] & (beyond <= 0)
+        wanted = np.where(near, np.where(idle, 0.0, beyond) - rows, np.nan).ravel()
+        free = np.broadcast_to(idle, rows.shape).ravel()
         steep = slopes.reshape(wanted.size, -1)
         known = np.isfinite(wanted) & np.all(np.isfinite(steep), axis=1)
         if not known.any():
             raise ValueError("nothing to cover: no measured row is finite")
         n, d = int(known.sum()), len(theta)
-        moved = steep[known]
-        moving = MOVING * float(np.max(np.abs(wanted[known]))) / (upper - lower)
+        free, wanted, steep = free[known], wanted[known], steep[known]
+        moved = np.where(free[:, None], 0.0, steep).sum(axis=0) / n
+        # +1: uncovered by t >= wanted - slope; -1: above its limit by t >= slope - wanted.
+        sign = np.where(free, -1.0, 1.0)
+        moving = MOVING * float(np.max(np.abs(wanted))) / (upper - lower)
         # theta' - theta as the difference of two numbers >= 0, so that its size is linear too.
-        cost = np.concatenate([moved.mean(axis=0) + moving, -moved.mean(axis=0) + moving, np.full(n, UNCOVERED / n)])
-        matrix = hstack([csr_matrix(-moved), csr_matrix(moved), -identity(n)]).tocsc()
+        cost = np.concatenate([moved + moving, -moved + moving, np.where(free, 1.0, UNCOVERED) / n])
+        signed = csr_matrix(sign[:, None] * steep)
+        matrix = hstack([-signed, signed, -identity(n)]).tocsc()
         most = np.concatenate([np.maximum(upper - theta, 0.0), np.maximum(theta - lower, 0.0), np.full(n, np.inf)])
-        found = linprog(cost, A_ub=matrix, b_ub=-wanted[known], bounds=np.stack([np.zeros_like(most), most], axis=1), method="highs")
+        found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=np.stack([np.zeros_like(most), most], axis=1), method="highs")
         if found.x is None:
             return theta
         theta = np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
@@ -183,6 +195,16 @@ def _near(controller: Controller, measured: NDArray[np.float64]) -> NDArray[np.b
         out[part] &= np.arange(part.stop - part.start) == np.argmax(closeness[part])
         first = part.stop
     return out
+
+
+def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Intervals in which every input was at one of its bounds, shape (K,)."""
+    count = len(episode)
+    p = ca.repmat(controller.parameters(theta, controller.model.nominal), 1, count)
+    given = (ca.repmat(ca.DM(theta), 1, count), p, episode.estimate.T)
+    lower, upper = (np.array(bound.map(count)(*given)).T for bound in (controller.input_lower, controller.input_upper))
+    room = AT_BOUND * np.maximum(upper - lower, 1e-12)
+    return np.asarray(np.all((episode.input >= upper - room) | (episode.input <= lower + room), axis=1))
 
 
 def _step(controller: Controller) -> ca.Function:

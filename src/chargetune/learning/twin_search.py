@@ -20,17 +20,20 @@ __all__ = ["Search"]
 PENALTY = 10.0
 # Of a limit's tolerance: what the search aims at, and what it accepts, since SLSQP ends a little on the wrong side. The rest
 # is left to noise and to what the twin does not know.
-AIMED, ACCEPTED = 0.25, 0.75
+AIMED, ACCEPTED = -0.5, 0.0
 STEP = 2e-3
 # Far inside a limit its excess says nothing: windows are cut here, in scaled units.
 FAR = -1.0
 
 
 class Search:
-    """Verdicts on the episodes of one plant by point of the unit cube, remembered."""
+    """Verdicts on the episodes of one plant by point of the unit cube, remembered.
 
-    def __init__(self, loop: TwinLoop, simulate: Simulate, space: ParameterSpace) -> None:
-        self._loop, self._simulate, self._space = loop, simulate, space
+    ``margin`` is added to the excess of each window, in tolerances.
+    """
+
+    def __init__(self, loop: TwinLoop, simulate: Simulate, space: ParameterSpace, margin: NDArray[np.float64] | float = 0.0) -> None:
+        self._loop, self._simulate, self._space, self._margin = loop, simulate, space, margin
         self._seen: dict[bytes, Score | None] = {}
         self._slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._unit = (1.0, 1.0)
@@ -89,7 +92,7 @@ class Search:
             score = self._seen[key]
             if score is None:
                 return True, np.inf
-            worst = float(np.nanmax(windows_of(score, ACCEPTED), initial=-np.inf))
+            worst = float(np.nanmax(windows_of(score, ACCEPTED) + self._margin, initial=-np.inf))
             return worst > 0, -score.objective if worst <= 0 else worst
 
         return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
@@ -99,7 +102,7 @@ class Search:
         score = self.score(u)
         if score is None:
             return np.inf, np.zeros(0)
-        excess = windows_of(score, AIMED)
+        excess = windows_of(score, AIMED) + self._margin
         return -score.objective / self._unit[0], np.where(np.isfinite(excess), excess, -np.inf) / self._unit[1]
 
     def _derivatives(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from chargetune.learning.belief import Belief, TwinLoop, believe, episodes_of
+from chargetune.learning.belief import Belief, Prediction, TwinLoop, believe, episodes_of, windows_of
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.envelope import covering
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
+from chargetune.learning.twin_search import AIMED as SEARCHED
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
@@ -33,6 +34,8 @@ TOGETHER = 1.0
 UNPROVED = 1.0
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
+# Iterations of the search that ends it.
+POLISHING = 8
 # Of a limit's tolerance, what the upper side of the prediction may use.
 AIMED = 0.5
 
@@ -106,7 +109,8 @@ class TwinTuner:
         seed = self.seed + 7919 * len(trials)
         proved = len(episodes_of(trials)) > 1
         deviations = float(norm.ppf(safety.probability)) + (TOGETHER if proved else TOGETHER + UNPROVED)
-        theta, passed = np.array(trials[-1].theta), []
+        # What the plant would allow if the belief were true: from there on caution only takes back.
+        theta, passed = self._covered(belief, np.array(trials[-1].theta)), []
         for k in range(ROUNDS):
             expected, predicted = belief.central(theta), belief.predict(theta, DRAWS, seed)
             score = None if expected is None else self.loop.score(expected)
@@ -119,8 +123,39 @@ class TwinTuner:
                 deviations *= WIDER
             following = covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
             # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
-            theta = following if k < 2 else (theta + following) / 2
-        return max(passed, key=lambda one: one[0])[1] if passed else self._tried(trials, belief, safety, seed)
+            theta = following if k < 1 else (theta + following) / 2
+        if not passed:
+            return self._tried(trials, belief, safety, seed)
+        theta = max(passed, key=lambda one: one[0])[1]
+        if not proved:
+            return theta
+        polished = self._polished(space, belief, theta, belief.predict(theta, DRAWS, seed), deviations)
+        safe = belief.predict(polished, DRAWS, seed).probability() >= safety.probability
+        return polished if safe else theta
+
+    def _polished(
+        self, space: ParameterSpace, belief: Belief, theta: NDArray[np.float64], predicted: Prediction, deviations: float
+    ) -> NDArray[np.float64]:
+        """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
+        expected = belief.central(theta)
+        score = None if expected is None else self.loop.score(expected)
+        if score is None:
+            return theta
+        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
+        search = Search(self.loop, belief.central, space, np.nan_to_num(margin))
+        start = space.to_unit(theta)
+        search.scale([start, space.to_unit(space.default)])
+        search.refine(start, POLISHING)
+        return space.from_unit(search.best())
+
+    def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Envelope steps on the plant that is expected."""
+        for _ in range(self.steps):
+            episode = belief.central(theta)
+            if episode is None:
+                break
+            theta = covering(self.loop.controller, episode, theta, self.loop.measured_rows(episode))
+        return theta
 
     def _tried(self, trials: Sequence[TrialLike], belief: Belief, safety: Safety, seed: int) -> NDArray[np.float64]:
         """The best theta that was tried, kept the limits, and is still predicted to."""

@@ -208,13 +208,14 @@ class Study:
         return incumbent
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
-        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self._episode, t.number)) for t in trials]
+        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in trials]
         thetas = np.asarray(self.tuner.ask(self.space, traced, n), dtype=float)
         if thetas.shape != (n, self.space.dimension):
             raise StudyError(f"the tuner proposed an array of shape {thetas.shape}, expected ({n}, {self.space.dimension})")
         return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
 
-    def _episode(self, number: int) -> Episode | None:
+    def episode(self, number: int) -> Episode | None:
+        """A trial's episode, None when none was stored or it is not an episode of this library."""
         trace = self.trace(number)
         try:
             return None if trace is None else Episode.from_arrays(*trace)
