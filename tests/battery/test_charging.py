@@ -152,7 +152,7 @@ def test_a_call_without_score_keeps_the_episode(by_hand):
     class Recorded:
         episode: Episode
 
-        def run(self, theta, seed):
+        def run(self, theta, seed, trips):
             return self.episode
 
     broken = by_hand.output_end.copy()

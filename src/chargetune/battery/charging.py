@@ -338,7 +338,7 @@ class ChargingProblem:
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
             raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        excess = {limit.name: limit.excess(episode, self._judged(limit)[0]) for limit in self.limits}
+        excess = {limit.name: limit.excess(episode, self.judged(limit)[0]) for limit in self.limits}
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
         # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
@@ -350,12 +350,12 @@ class ChargingProblem:
             objective=-float(np.mean(deficit)),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
             excess={name: float(np.max(values)) for name, values in excess.items()},
-            tolerance={limit.name: self._judged(limit)[1] for limit in self.limits},
+            tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
             metrics=metrics,
             profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
         )
 
-    def _judged(self, limit: Limit) -> tuple[int, float]:
+    def judged(self, limit: Limit) -> tuple[int, float]:
         """(intervals of the moving mean, excess still called kept): of a noisy signal what `NOISE_SD` sd of that mean may be."""
         noise = self.sensors.noise_sd.get(limit.signal, 0.0)
         samples = self.verdict_samples if noise > 0 else 1
@@ -364,7 +364,7 @@ class ChargingProblem:
     def violation_mVs(self, episode: Episode) -> float:
         """Excess of the upper voltage limit beyond its tolerance, in the moving mean of the verdict, over time, mV s."""
         limit = self.limits[0]
-        samples, tolerance = self._judged(limit)
+        samples, tolerance = self.judged(limit)
         beyond = np.maximum(0.0, np.nan_to_num(limit.excess(episode, samples)) - tolerance)
         return float(1e3 * episode.sampling_time_s * np.sum(beyond))
 

@@ -17,6 +17,7 @@ from chargetune.episode.compiled import compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.model.model import Model
+from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
 __all__ = ["MEANING", "Draw", "Spread", "Variations"]
@@ -95,7 +96,7 @@ class Variations:
     def run(self, draw: Draw, theta: ArrayLike) -> tuple[Score | None, Episode]:
         """One charge on the drawn plant and the verdict on its true outputs; no score when it did not come to its end."""
         problem, factors, known = self.problem, draw.factors, self.problem.plant_model
-        own = replace(problem, soc_start=draw.soc_start, verdict_samples=1)
+        own = replace(problem, soc_start=draw.soc_start, verdict_samples=1, abort_margin_V=None, abort_margin_K=None)
         if isinstance(known, Electrochemical):
             resistance = max(1.0, known.resistance_scale * factors["R0_ohm"])
             other = replace(known, resistance_scale=resistance, capacity_scale=known.capacity_scale * factors["capacity_Ah"])
@@ -112,6 +113,6 @@ class Variations:
         if episode.ending is not Ending.DONE:
             return None, episode
         try:
-            return own.score(episode.noise_free()), episode
+            return replace(own, sensors=Sensors()).score(episode.noise_free()), episode
         except ValueError:
             return None, episode

@@ -60,7 +60,7 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
             out.append(Check(name, bound, 1e-9, float(current[worst]), float(at_start[worst]), excess, "input", None, None))
     stored = {} if score is None else score.excess
     for limit in problem.limits:
-        samples = problem.verdict_samples if problem.sensors.noise_sd.get(limit.signal, 0.0) > 0 else 1
+        samples, tolerance = problem.judged(limit)
         reached, at_s = _worst(episode, limit.signal, samples, upper=limit.upper, true=False)
         true, _ = _worst(episode, limit.signal, 1, upper=limit.upper, true=True) if episode.true_end is not None else (None, 0.0)
         judged = "samples" if samples == 1 else f"mean of {samples} intervals"
@@ -69,7 +69,7 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
             Check(
                 limit.name,
                 limit.bound,
-                limit.tolerance,
+                tolerance,
                 reached,
                 at_s,
                 sign * (reached - limit.bound),

@@ -1,0 +1,207 @@
+"""How many trials each tuner needs, and what it breaks on the way: true values of plants that the learner sees through noise.
+
+    python benchmarks/learning.py --plant ecm --study r0 --methods safe,twin,ilc,default --seeds 0:20 --trials 4 --json
+
+A row is one method after one number of trials. Solved: the true, noise-free excess of the theta that the learner recommends
+is at most 1 mV and its t95 within 1.05 of the attainable one. Recommended is the newest theta by the methods that learn from
+traces (safe, twin, ilc), the best that kept the limits as measured by the others. Attainable: the least t95 with at most
+1 mV over the limit that envelope steps and SLSQP on the true plant find, computed here and kept in --cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from learning_peers import CmaEs, Tpe
+from learning_plants import PLANTS, STUDIES, exact, make_problem
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from chargetune import learning
+from chargetune.battery.reproduce import tuned_trial
+from chargetune.battery.twin import ChargingTwin
+from chargetune.learning.tuner import sobol_points
+from chargetune.learning.twin_search import Search
+
+WITHIN, EXCESS_MV = 1.05, 1.0
+FROM_TRACES = ("safe", "twin", "ilc")
+
+
+def _safe(problem: Any, seed: int) -> Any:
+    # The corner that is declared safe: largest resistances, largest backoff.
+    start = tuple(float(v) for v in problem.space.upper)
+    return learning.TwinTuner(ChargingTwin(problem), seed=seed, safety=learning.Safety(start=start))
+
+
+METHODS = {
+    "safe": _safe,
+    "twin": lambda problem, seed: learning.TwinTuner(ChargingTwin(problem), seed=seed),
+    "ilc": lambda problem, _: learning.Envelope(ChargingTwin(problem)),
+    "default": lambda _, seed: learning.ConstrainedLogEI(seed=seed),
+    "ei": lambda _, seed: learning.ExpectedImprovement(seed=seed),
+    "sobol": lambda _, seed: learning.Sobol(seed=seed),
+    "cmaes": lambda problem, seed: CmaEs(problem.space, seed),
+    "tpe": lambda problem, seed: Tpe(problem.space, seed),
+}
+
+
+def attainable_t95(plant: str, study: str, seed: int) -> float:
+    """min over the theta of this study on this plant, min; inf when no theta found keeps the limit within 1 mV."""
+    problem = replace(exact(make_problem(plant, study, seed, 0.0)), soc_windows=24)
+    best = [float("inf")]
+
+    class Truth:
+        controller = problem.controller
+
+        def measured_rows(self, episode: Any) -> Any:
+            return problem.measured_rows(episode) - 5e-4
+
+        def score(self, episode: Any) -> Any:
+            score = problem.score(episode)
+            if score.feasible and score.metrics["t95_min"]:
+                best[0] = min(best[0], score.metrics["t95_min"])
+            return score
+
+    search = Search(Truth(), problem.episode, problem.space)  # type: ignore[arg-type]
+    space = problem.space
+    first = [space.to_unit(space.default), np.full(space.dimension, 0.9)]
+    pool = [*first, *sobol_points(space.dimension, 0, 0, 64)]
+    search.scale(pool)
+    for start in first:
+        search.envelope(start, 8)
+    for start in (search.best(), *sorted(pool, key=search.merit)[:3]):
+        search.refine(start, 60)
+    search.refine(search.best(), 60)
+    return best[0]
+
+
+def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int]) -> dict[str, Any]:
+    """True excess and t95 of every trial of one method on one seed."""
+    method, seed = job
+    problem = make_problem(plant, study, seed, noise_V)
+    truth, tuner = exact(problem), METHODS[method](problem, seed)
+    told: list[Any] = []
+    out: dict[str, Any] = {"method": method, "seed": seed, "excess_mV": [], "t95": [], "ask_s": [], "recommended": []}
+    for number in range(trials):
+        begin = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            theta = tuner.ask(problem.space, told, 1)[0]
+        out["ask_s"].append(time.perf_counter() - begin)
+        score, episode, ending = problem(theta, 1000 * seed + number)
+        status = "done" if score else "failed"
+        told.append(
+            SimpleNamespace(number=number, theta=tuple(theta), status=status, score=score, ending=ending, episode=lambda e=episode: e)
+        )
+        metrics = truth.score(truth.episode(theta)).metrics
+        out["excess_mV"].append(metrics["overshoot_mV"])
+        out["t95"].append(metrics["t95_min"] or float("inf"))
+        best = told[-1] if method in FROM_TRACES else tuned_trial(told, "default")
+        out["recommended"].append(number if best is None else best.number)
+    return out
+
+
+def rows(runs: list[dict[str, Any]], args: argparse.Namespace, attainable: dict[int, float]) -> list[dict[str, Any]]:
+    found = []
+    for method in args.methods:
+        own = [r for r in runs if r["method"] == method]
+        for count in range(1, args.trials + 1):
+            at = [r["recommended"][count - 1] for r in own]
+            ratios = [r["t95"][k] / attainable[r["seed"]] for r, k in zip(own, at, strict=True)]
+            kept = [r["excess_mV"][k] <= EXCESS_MV for r, k in zip(own, at, strict=True)]
+            excess = np.concatenate([r["excess_mV"][:count] for r in own])
+            found.append(
+                {
+                    "method": method, "plant": args.plant, "study": args.study, "noise_mV": args.noise_mV, "trials": count,
+                    "solved": int(sum(k and q <= WITHIN for k, q in zip(kept, ratios, strict=True))), "of": len(own),
+                    "t95_ratio_median": _number(np.median(ratios)), "t95_ratio_worst": _number(np.max(ratios)),
+                    "violating_trials": int(np.sum(excess > EXCESS_MV)), "all_trials": len(excess),
+                    "worst_excess_mV": float(np.max(excess)), "ask_s_median": float(np.median([r["ask_s"][count - 1] for r in own])),
+                }
+            )  # fmt: skip
+    return found
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def main() -> None:
+    args = arguments()
+    attainable = optima(args)
+    jobs = list(product(args.methods, args.seeds))
+    work = partial(run, args.plant, args.study, args.noise_mV / 1e3, args.trials)
+    screen = Console(stderr=True)
+    with ProcessPoolExecutor(args.workers) as pool:
+        runs = list(track(pool.map(work, jobs), "learning", total=len(jobs), console=screen, disable=args.json and not screen.is_terminal))
+    found = rows(runs, args, attainable)
+    if args.json:
+        print(json.dumps({"rows": found}))
+        return
+    table = Table("method", "trials", "solved", "t95 ratio median", "worst", "violating", "worst excess mV", "ask s")
+    for r in found:
+        ratios = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("t95_ratio_median", "t95_ratio_worst")]
+        violating = f"{r['violating_trials']}/{r['all_trials']}"
+        table.add_row(
+            r["method"],
+            str(r["trials"]),
+            f"{r['solved']}/{r['of']}",
+            *ratios,
+            violating,
+            f"{r['worst_excess_mV']:.1f}",
+            f"{r['ask_s_median']:.1f}",
+        )
+    Console().print(table)
+
+
+def optima(args: argparse.Namespace) -> dict[int, float]:
+    """Attainable t95 by seed, from the cache where it is known."""
+    known: dict[str, float] = json.loads(args.cache.read_text()) if args.cache.exists() and not args.recompute else {}
+    missing = [s for s in args.seeds if f"{args.plant} {args.study} {s}" not in known]
+    screen = Console(stderr=True)
+    with ProcessPoolExecutor(args.workers) as pool:
+        work = pool.map(partial(attainable_t95, args.plant, args.study), missing)
+        for seed, value in zip(missing, track(work, "attainable", total=len(missing), console=screen, disable=args.json), strict=True):
+            known[f"{args.plant} {args.study} {seed}"] = value
+    args.cache.parent.mkdir(parents=True, exist_ok=True)
+    args.cache.write_text(json.dumps(known))
+    return {s: known[f"{args.plant} {args.study} {s}"] for s in args.seeds}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plant", choices=PLANTS, default="ecm")
+    parser.add_argument("--study", choices=sorted(STUDIES), default="r0")
+    parser.add_argument("--methods", default="safe,twin,ilc,default", help=f"of {','.join(METHODS)}")
+    parser.add_argument("--seeds", default="0:20", help="A:B, B not included")
+    parser.add_argument("--trials", type=int, default=4)
+    parser.add_argument("--noise-mV", dest="noise_mV", type=float, default=2.0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--cache", type=Path, default=Path("out/learning/attainable.json"))
+    parser.add_argument("--recompute", action="store_true", help="compute the attainable t95 anew")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    args.methods = args.methods.split(",")
+    unknown = sorted(set(args.methods) - set(METHODS))
+    if unknown:
+        sys.exit(f"methods: unknown {unknown}, allowed are {', '.join(METHODS)}")
+    first, _, last = args.seeds.partition(":")
+    args.seeds = range(int(first), int(last or int(first) + 1))
+    return args
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Plants and studies of the learning benchmark; each problem is the learner's, `exact` is what it is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import casadi as ca
+
+from chargetune.battery.cell import Cell, default_cell
+from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.config import load_config
+from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.theta import Backoff, ResistanceRatio
+from chargetune.model.model import Model, Signal
+from chargetune.plants.sensors import Sensors
+from chargetune.plants.simulated import SimulatedPlant
+
+__all__ = ["PLANTS", "STUDIES", "StructuralPlant", "UnknownCell", "exact", "make_problem"]
+
+# theta of each study: nine nodes of R0, eleven of a signed backoff, and the paper's backoff and R1.
+STUDIES = {
+    "r0": {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)},
+    "signed": {"backoff": Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)},
+    "backoff": {"backoff": Backoff(lower_V=0.0, upper_V=0.2)},
+    "model": {"ratios": (ResistanceRatio("R1"),)},
+}
+PLANTS = ("ecm", "unknown", "structural", "dfn")
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_fast_charge.toml"
+
+
+@dataclass(frozen=True)
+class StructuralPlant:
+    """A cell that no R-RC circuit is: a second pair, an R0 that falls through the episode, another OCV."""
+
+    cell: Cell
+    resistance_ohm: float = 0.012
+    time_constant_s: float = 300.0
+    drift: float = 0.12
+    duration_s: float = 3600.0
+    ocv_V: float = 0.004
+
+    def plant(self, soc_start: float, sampling_time_s: float, sensors: Sensors) -> SimulatedPlant:
+        count = len(self.cell.soc)
+        cell = replace(
+            self.cell,
+            R2_ohm=(self.resistance_ohm,) * count,
+            C2_F=(self.time_constant_s / self.resistance_ohm,) * count,
+            ocv_V=tuple(v + self.ocv_V for v in self.cell.ocv_V),
+        )
+        base = ecm_model(cell, sampling_time_s)
+        nx = len(base.states)
+        x, u, p = (ca.SX.sym(name, size) for name, size in (("x", nx + 1), ("u", 1), ("p", base.nominal.size)))
+        scaled, first = ca.SX(p), 0
+        for name, values in base.parameters:
+            if name == "R0_ohm":
+                block = slice(first, first + len(values))
+                scaled[block] = p[block] * (1 - self.drift * x[nx] / self.duration_s)
+            first += len(values)
+        model = Model(
+            "R-RC-RC circuit with drift", (*base.states, Signal("elapsed_s", "s")), base.inputs, base.outputs, base.parameters,
+            sampling_time_s, ca.Function("f", [x, u, p], [ca.vertcat(base.f(x[:nx], u, scaled), x[nx] + sampling_time_s)]),
+            ca.Function("h", [x, u, p], [base.h(x[:nx], u, scaled)]),
+        )  # fmt: skip
+        return SimulatedPlant(model, start_state(cell, soc_start), sensors)
+
+
+@dataclass(frozen=True)
+class UnknownCell:
+    """The circuit with another capacity, SOC at the start and OCV than the learner believes."""
+
+    cell: Cell
+    capacity: float
+    soc: float
+    ocv_V: float
+
+    def plant(self, soc_start: float, sampling_time_s: float, sensors: Sensors) -> SimulatedPlant:
+        cell = replace(
+            self.cell, capacity_Ah=self.cell.capacity_Ah * (1 + self.capacity), ocv_V=tuple(v + self.ocv_V for v in self.cell.ocv_V)
+        )
+        return SimulatedPlant(ecm_model(cell, sampling_time_s), start_state(cell, soc_start + self.soc), sensors)
+
+
+def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingProblem:
+    """What the learner sees: noisy outputs, its own wrong model. Raises ValueError for an unknown plant or study."""
+    if plant not in PLANTS or study not in STUDIES:
+        raise ValueError(f"plant = {plant!r}, study = {study!r}; allowed are {', '.join(PLANTS)} and {', '.join(STUDIES)}")
+    sensors = Sensors(noise_sd={"voltage_V": noise_V}) if noise_V else Sensors()
+    if plant == "dfn":
+        config = load_config(EXAMPLE)
+        return replace(config.problem(EXAMPLE.parent), sensors=sensors)
+    cell = default_cell()
+    problem = ChargingProblem(cell, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **STUDIES[study])  # type: ignore[arg-type]
+    if plant == "structural":
+        return replace(problem, plant_model=StructuralPlant(cell))
+    if plant == "unknown":
+        import numpy as np
+
+        draw = np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, 3) * (0.05, 0.02, 0.005)
+        return replace(problem, plant_model=UnknownCell(cell, *(float(v) for v in draw)))
+    return problem
+
+
+def exact(problem: ChargingProblem) -> ChargingProblem:
+    """The same plant and controller, judged without noise, with the benchmark's tolerance of 1 mV."""
+    return replace(problem, sensors=Sensors(), verdict_samples=1, tolerance_V=1e-3)
