@@ -1,11 +1,15 @@
 """Trials for the tests of tuners."""
 
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from chargetune.episode.score import Score
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @dataclass(frozen=True)

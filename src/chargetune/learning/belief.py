@@ -64,16 +64,15 @@ class TwinLoop(EnvelopeLoop, Protocol):
 
 @dataclass(frozen=True)
 class Belief:
-    """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet."""
+    """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
+
+    ``mistake``: how wrong those before it were about the newest trial (`Discrepancy.foretold`); 0 before two are known.
+    """
 
     loop: TwinLoop
     posterior: Posterior
     discrepancy: Discrepancy | None
-
-    @property
-    def scale(self) -> float:
-        """How many times more than stated the newest trial differed from what those before it foretold; 1 before two are known."""
-        return self.discrepancy.scale if self.discrepancy else 1.0
+    mistake: float = 0.0
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
@@ -168,10 +167,11 @@ def episodes_of(trials: Sequence[TrialLike], newest: int | None = None) -> list[
 def believe(loop: TwinLoop, trials: Sequence[TrialLike]) -> Belief:
     """What the traces of these trials say; the prior when there is none."""
     episodes = tuple(episodes_of(trials, TRACES_MAX))
-    scale, guess = 1.0, None
+    scale, mistake, guess = 1.0, 0.0, None
     if len(episodes) > 1:
         # How well the newest trial was foretold by those before it is how far its own successor can be trusted.
         before = loop.twin.fit(episodes[:-1])
-        scale, guess = Discrepancy(before, episodes[:-1], loop.features).calibrated_scale(episodes[-1]), before.mode
+        guess = before.mode
+        scale, mistake = Discrepancy(before, episodes[:-1], loop.features).foretold(episodes[-1])
     posterior = loop.twin.fit(episodes, guess=guess)
-    return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None)
+    return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None, mistake)

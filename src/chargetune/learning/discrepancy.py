@@ -83,12 +83,14 @@ class Discrepancy:
 
         return add
 
-    def calibrated_scale(self, episode: Episode) -> float:
-        """How many times larger than stated the discrepancy is where nothing was measured, as one episode not learnt from shows.
+    def foretold(self, episode: Episode) -> tuple[float, float]:
+        """(scale, mistake) of the prediction of one episode that was not learnt from, at its recorded input.
 
-        The most probable factor s on its standard deviation d, given by how much r each stretch of the episode, at the recorded
-        input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1). Neighbouring
-        stretches err together, so `TOGETHER` of them count as one.
+        Scale: how many times larger than stated the discrepancy is where nothing was measured. Mistake: root mean square of what
+        the prediction was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
+        The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episode, at
+        the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
+        Neighbouring stretches err together, so `TOGETHER` of them count as one.
         """
         posterior, twin = self.posterior, self.posterior.twin
         predicted = twin.predict(posterior.mode, episode.input)
@@ -107,7 +109,9 @@ class Discrepancy:
         scales = np.geomspace(0.1, 10.0, 61)
         variance = scales[:, None] ** 2 * unmodelled + rest
         chance = -0.5 * np.sum(np.log(variance) + square / variance, axis=1) / TOGETHER - 0.5 * np.log(scales) ** 2
-        return float(scales[np.argmax(chance)])
+        stated = np.array([twin.error_sd.get(name, 0.0) for name in twin.noise_sd])
+        mistake = np.sqrt(np.mean(square / (rest + np.broadcast_to(stated**2, left.shape)[known]))) if known.any() else 0.0
+        return float(scales[np.argmax(chance)]), float(mistake)
 
     def _table(self, values: NDArray[np.float64]) -> RegularGridInterpolator:
         nodes = [np.linspace(low, high, count) for count, (low, high) in zip(self._nodes, self.features.values(), strict=True)]

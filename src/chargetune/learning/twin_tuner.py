@@ -23,7 +23,7 @@ from chargetune.model.parameters import ParameterSpace
 __all__ = ["TwinTuner"]
 
 # Times more wrong than allowed for, at which a twin is none.
-MISTAKEN = 9.9
+MISTAKEN = 3.5
 # Plants of an ensemble; the standard error of a probability of 0.95 is 0.027.
 DRAWS = 48
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
@@ -32,6 +32,8 @@ ROUNDS = 7
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
+# Standard deviations that are taken back where nothing is promised; half of the plants would break a limit otherwise.
+CAUTION = 2.5
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
 # Iterations of the search that ends it.
@@ -75,9 +77,9 @@ class TwinTuner:
         if belief is None or belief.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
             return out[:n]
-        if belief.scale >= MISTAKEN and len(trials) > 2:
+        if belief.mistake >= MISTAKEN and len(trials) > 2:
             warnings.warn(
-                f"the twin did not foresee the last trial (off by {belief.scale:.0f} times what it allows for): "
+                f"the twin did not foresee the last trial (off by {belief.mistake:.0f} times what it allows for): "
                 "this proposal is the black box's",
                 RuntimeWarning,
                 stacklevel=2,
@@ -85,7 +87,9 @@ class TwinTuner:
             return ConstrainedLogEI(self.seed).ask(space, trials, n)
         first = self._points(space, trials)
         plants = [belief.central, *(belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n - 1))]
-        return np.array([space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants])
+        thetas = [space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants]
+        predicted = belief.predict(thetas[0], DRAWS, self.seed + 7919 * len(trials))
+        return np.array([self._polished(space, belief, thetas[0], predicted, CAUTION), *thetas[1:]])
 
     def _points(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
         """Where a search may begin: theta_0, Sobol's points, the thetas tried so far, the last one last."""

@@ -1,0 +1,143 @@
+"""Safe learning: what reaches the plant, what it promises, and when it stops."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from two_pairs import TwoPairs
+
+from chargetune.battery.cell import default_cell
+from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRatio
+from chargetune.battery.twin import ChargingTwin
+from chargetune.episode.episode import Ending
+from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
+from chargetune.learning.belief import believe
+from chargetune.plants.sensors import Sensors
+
+CELL = default_cell()
+
+
+def charge(seed=1, noise=0.002, **changes):
+    sensors = Sensors(noise_sd={"voltage_V": noise}) if noise else Sensors()
+    parts = {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)} | changes
+    return ChargingProblem(CELL, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **parts)
+
+
+def told(number, theta, score, episode):
+    return SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda: episode)
+
+
+def learn(problem, tuner, count):
+    """(trials, true excess in mV, t95 in min) of ``count`` trials."""
+    exact, trials, excess, minutes = replace(problem, sensors=Sensors()), [], [], []
+    for number in range(count):
+        theta = tuner.ask(problem.space, trials)[0]
+        score, episode, _ = problem(theta, number)
+        trials.append(told(number, theta, score, episode))
+        metrics = exact.score(exact.episode(theta)).metrics
+        excess.append(metrics["overshoot_mV"])
+        minutes.append(metrics["t95_min"] or np.inf)
+    return trials, excess, minutes
+
+
+def test_three_trials_and_none_breaks_the_limit():
+    """Nine R0 nodes, resistances wrong by up to half, 2 mV noise; 36.7 min is what 4000 evaluations of CMA-ES reach."""
+    problem = charge()
+    trials, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 3)
+    np.testing.assert_allclose(trials[0].theta, problem.space.upper)
+    assert max(excess) <= 1.0
+    assert minutes[-1] <= 1.05 * 36.7
+
+
+def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
+    problem = charge(plant_model=TwoPairs(CELL))
+    _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
+    assert max(excess) <= 5.0
+    assert excess[-1] <= 2.0
+    assert minutes[-1] < 50.0
+
+
+def test_the_first_theta_is_the_declared_one_or_the_corner_that_is_safe():
+    problem = charge()
+    declared = tuple(np.full(9, 2.5))
+    np.testing.assert_array_equal(TwinTuner(ChargingTwin(problem), safety=Safety(start=declared)).ask(problem.space, [], 2), [declared] * 2)
+    # A backoff of at most 50 mV cannot cover what the prior allows.
+    narrow = ChargingProblem(CELL, mismatch_seed=1, backoff=Backoff(nodes=5, lower_V=0.0, upper_V=0.05))
+    with pytest.raises(NoSafeThetaError, match=r"no corner .* probability 0\.95"):
+        TwinTuner(ChargingTwin(narrow), safety=Safety()).ask(narrow.space, [])
+    with pytest.raises(ValueError, match=r"R0_ratio\[0\] = 9"):
+        TwinTuner(ChargingTwin(problem), safety=Safety(start=(9.0,) * 9)).ask(problem.space, [])
+
+
+def test_a_spent_budget_stops_before_anything_is_proposed():
+    problem = charge(noise=0.0)
+    score, episode, _ = problem(problem.space.default, 0)
+    spent = problem.violation_mVs(episode)
+    beyond = np.maximum(*episode.signal("voltage_V")) - problem.voltage_max_V - problem.tolerance_V
+    assert spent == pytest.approx(1e3 * 10.0 * np.sum(np.maximum(beyond, 0.0)))
+    trials = [told(0, problem.space.default, score, episode)]
+    with pytest.raises(NoSafeThetaError, match="budget of violation is spent"):
+        TwinTuner(ChargingTwin(problem), safety=Safety(budget=0.9 * spent)).ask(problem.space, trials)
+    assert np.all(np.isfinite(TwinTuner(ChargingTwin(problem), safety=Safety(budget=1.1 * spent)).ask(problem.space, trials)))
+
+
+def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_said():
+    problem = charge(noise=0.0)
+    theta = np.full(9, 3.0)
+    score, episode, _ = problem(theta, 0)
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    belief = believe(tuner.loop, trials := [told(0, theta, score, episode)])
+    with pytest.warns(RuntimeWarning, match="no safe improvement is known"):
+        np.testing.assert_array_equal(tuner._tried(trials, belief, Safety(), 0), theta)
+    unsafe, trace, _ = problem(problem.space.default, 0)
+    trials = [told(0, problem.space.default, unsafe, trace)]
+    with pytest.raises(NoSafeThetaError, match="nothing was proposed"):
+        tuner._tried(trials, believe(tuner.loop, trials), Safety(), 0)
+
+
+def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
+    problem = charge(noise=0.0)
+    trials = []
+    for number, theta in enumerate((np.full(9, 3.0), np.full(9, 2.5), np.full(9, 2.0))):
+        score, episode, _ = problem(theta, number)
+        wrong = episode.output_end.copy()
+        wrong[:, 0] += 0.3 * np.sin(np.arange(len(episode)) / 25 + 2 * number)
+        trials.append(told(number, theta, score, replace(episode, output_end=wrong, output_start=wrong)))
+    tuner = TwinTuner(ChargingTwin(problem))
+    assert believe(tuner.loop, trials).mistake > 4
+    with pytest.warns(RuntimeWarning, match="the black box's"):
+        proposed = tuner.ask(problem.space, trials)
+    assert proposed.shape == (1, 9)
+
+
+def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
+    problem = charge(noise=0.0, abort_margin_V=0.02)
+    score, episode, ending = problem(problem.space.default, 0)
+    start, end = episode.signal("voltage_V")
+    assert score is None
+    assert episode.ending is Ending.LIMIT
+    assert "voltage_V" in ending
+    assert np.max(np.maximum(start, end)[:-1]) <= 4.22 < max(start[-1], end[-1])
+    # It is learnt from like any other trace.
+    belief = believe(ChargingTwin(problem), [told(0, problem.space.default, None, episode)])
+    assert belief.discrepancy is not None
+    whole = replace(problem, abort_margin_V=None).episode()
+    assert len(episode) < len(whole)
+    np.testing.assert_array_equal(episode.input, whole.input[: len(episode)])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Safety(probability=1.0), "probability = 1.0"),
+        (lambda: Safety(probability=0.2), "probability = 0.2"),
+        (lambda: Safety(budget=-1.0), "budget = -1.0"),
+        (lambda: charge(abort_margin_V=0.0), "abort_margin_V = 0"),
+        (lambda: charge(abort_margin_K=-1.0), "abort_margin_K = -1"),
+    ],
+)
+def test_nonsense_is_refused_by_name(make, said):
+    with pytest.raises(ValueError, match="=") as caught:
+        make()
+    assert said in str(caught.value)
