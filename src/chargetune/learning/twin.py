@@ -9,6 +9,7 @@ Source: MacKay, Neural Computation 4 (1992) 448; Bock, in Modelling of Chemical 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.episode.episode import Episode
 from chargetune.learning.posterior import Posterior
 from chargetune.model.model import Model
@@ -29,6 +31,8 @@ __all__ = ["BLOCKS", "Twin", "Uncertain", "blocks"]
 REFITS = 2
 # Stretches of an episode over which residuals are averaged: what a model cannot represent changes slowly.
 BLOCKS = 40
+# Intervals of the shortest roll-out that is built; longer ones are this times a power of two.
+SHORTEST = 45
 # A step that changes the misfit, or the unknowns, by less than this is the last one.
 FTOL, XTOL = 1e-6, 1e-5
 
@@ -112,21 +116,26 @@ class Twin:
 
     def parameters(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
         """The model's parameter vector p for unknowns m, shape (np,)."""
-        return np.array(_maps(self)[0](m)).ravel()
+        return np.array(_mapping(_Key(self))[0](m, *_numbers(self))).ravel()
 
     def start_state(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
         """The state at the start of a trial for unknowns m, shape (nx,)."""
-        return np.array(_maps(self)[1](m)).ravel()
+        return np.array(_mapping(_Key(self))[1](m, *_numbers(self))).ravel()
 
     def predict(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Measured outputs at both ends of every interval under ``inputs`` (K, nu), shape (K, 2, number of measured outputs)."""
-        flat = np.array(_simulation(self, len(inputs))[0](m, inputs.T))
-        return flat.T.reshape(len(inputs), 2, len(self.noise_sd))
+        flat = self._roll(0, m, inputs)
+        return flat.T.reshape(-1, 2, len(self.noise_sd))[: len(inputs)]
 
     def slopes(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Exact slopes of `predict` with respect to m, shape (K, 2, number of measured outputs, d)."""
-        flat = np.array(_simulation(self, len(inputs))[1](m, inputs.T))
-        return flat.reshape(len(inputs), 2, len(self.noise_sd), -1)
+        flat = self._roll(1, m, inputs)
+        return flat.reshape(-1, 2, len(self.noise_sd), sum(self.sizes))[: len(inputs)]
+
+    def _roll(self, which: int, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+        length = _padded(len(inputs))
+        padded = np.vstack([inputs, np.zeros((length - len(inputs), inputs.shape[1]))])
+        return np.array(_simulated(_Key(self), length)[which](m, *_numbers(self), padded.T))
 
     def measured(self, episode: Episode) -> NDArray[np.float64]:
         """The measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
@@ -198,19 +207,13 @@ def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> 
     return np.sqrt(whole), np.sqrt(noise**2 + together * slow + (whole - slow))
 
 
-def _maps(twin: Twin) -> tuple[ca.Function, ca.Function]:
-    """(m -> p, m -> x0)."""
-    return _mapping(_Key(twin))
-
-
 class _Key:
-    """A twin as key of a cache: by what it is built of, because mappings do not hash."""
+    """A twin as key of a cache: its structure without its numbers, because the functions take these as arguments."""
 
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
         model = twin.model
-        numbers = (model.parameters, twin.unknowns, tuple(twin.noise_sd), tuple(twin.start.items()))
-        self._content = (model.f.__hash__(), model.h.__hash__(), *numbers)
+        self._content = (model.f.__hash__(), model.h.__hash__(), twin.unknowns, tuple(twin.noise_sd))
 
     def __hash__(self) -> int:
         return hash(self._content)
@@ -219,40 +222,54 @@ class _Key:
         return isinstance(other, _Key) and self._content == other._content
 
 
-def _simulation(twin: Twin, count: int) -> tuple[ca.Function, ca.Function]:
-    """((m, inputs) -> outputs, their Jacobian with respect to m) for ``count`` intervals."""
-    return _simulated(_Key(twin), count)
+def _numbers(twin: Twin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(nominal parameters, nominal start state)."""
+    return twin.model.nominal, np.array([float(twin.start.get(name, 0.0)) for name in twin.model.state_names])
 
 
-def _symbols(twin: Twin) -> tuple[Any, Any, Any]:
-    """(m, p(m), x0(m)) as expressions."""
+def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any]:
+    """(m, nominal parameters, nominal start, p(m), x0(m)) as expressions."""
     model = twin.model
     m = ca.SX.sym("m", sum(twin.sizes))
+    nominal, begin = ca.SX.sym("nominal", model.nominal.size), ca.SX.sym("begin", len(model.states))
     pieces = ca.vertsplit(m, np.cumsum([0, *twin.sizes]).tolist())
     parts = {(one.name, one.kind == "start"): piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
     kinds = {one.name: one.kind for one in twin.unknowns if one.kind != "start"}
-    blocks = []
+    blocks, first = [], 0
     for name, values in model.parameters:
-        nominal = ca.DM(values)
-        change = parts.get((name, False))
-        blocks.append(nominal if change is None else nominal * ca.exp(change) if kinds[name] == "factor" else nominal + change)
-    starts = [float(twin.start.get(name, 0.0)) + parts.get((name, True), 0.0) for name in model.state_names]
-    return m, ca.vertcat(*(ca.SX(b) for b in blocks)), ca.vertcat(*(ca.SX(s) for s in starts))
+        block, change = nominal[first : first + len(values)], parts.get((name, False))
+        blocks.append(block if change is None else block * ca.exp(change) if kinds[name] == "factor" else block + change)
+        first += len(values)
+    starts = [begin[i] + parts.get((name, True), 0.0) for i, name in enumerate(model.state_names)]
+    return m, nominal, begin, ca.vertcat(*blocks), ca.vertcat(*starts)
 
 
 @lru_cache(maxsize=16)
 def _mapping(key: _Key) -> tuple[ca.Function, ca.Function]:
-    m, p, x0 = _symbols(key.twin)
-    return ca.Function("p", [m], [p]), ca.Function("x0", [m], [x0])
+    """(m, nominal, begin) -> p, and -> x0."""
+    m, nominal, begin, p, x0 = _symbols(key.twin)
+    return ca.Function("p", [m, nominal, begin], [p]), ca.Function("x0", [m, nominal, begin], [x0])
 
 
-@lru_cache(maxsize=64)
+def _padded(count: int) -> int:
+    """Functions are built for a few lengths only; what is appended to a shorter trace is simulated and cut off."""
+    length = SHORTEST
+    while length < count:
+        length *= 2
+    return length
+
+
+@lru_cache(maxsize=32)
 def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
-    """State and its sensitivity are rolled out together: one small function an interval, exact by the chain rule."""
+    """((m, nominal, begin, inputs) -> outputs, their Jacobian with respect to m) for ``count`` intervals.
+
+    State and its sensitivity are rolled out together: one small function an interval, exact by the chain rule. Machine code
+    where there is a C compiler: a posterior and an ensemble take thousands of roll-outs.
+    """
     twin = key.twin
     model = twin.model
     nx, nu, d = len(model.states), len(model.inputs), sum(twin.sizes)
-    m, p, x0 = _symbols(twin)
+    m, nominal, begin, p, x0 = _symbols(twin)
     x, u, sensitivity = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("S", nx, d)
     rows = [model.output_names.index(name) for name in twin.noise_sd]
 
@@ -265,14 +282,29 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     slope_start = ca.mtimes(ca.jacobian(start, x), sensitivity) + ca.jacobian(start, m)
     slope_end = ca.mtimes(ca.jacobian(end, at), ahead) + ca.jacobian(end, m)
     end, slope_end = (ca.substitute([e], [at], [after])[0] for e in (end, slope_end))
-    plain = ca.Function("plain", [x, u, m], ca.cse([after, ca.vertcat(start, end)]))
+    fixed = [m, nominal, begin]
+    plain = ca.Function("plain", [x, u, *fixed], ca.cse([after, ca.vertcat(start, end)]))
     # Row by row, so that the result reshapes to (interval, end, output, unknown).
     slopes = ca.vec(ca.vertcat(slope_start, slope_end).T)
-    with_slopes = ca.Function("with_slopes", [x, sensitivity, u, m], ca.cse([ca.densify(e) for e in (after, ahead, slopes)]))
+    with_slopes = ca.Function("with_slopes", [x, sensitivity, u, *fixed], ca.cse([ca.densify(e) for e in (after, ahead, slopes)]))
 
-    mm, inputs = ca.MX.sym("m", d), ca.MX.sym("inputs", nu, count)
-    begin = ca.Function("begin", [m], [x0, ca.densify(ca.jacobian(x0, m))])
-    state, first = begin(mm)
-    _, seen = plain.mapaccum("values", count)(state, inputs, ca.repmat(mm, 1, count))
-    _, _, steep = with_slopes.mapaccum("slopes", count, 2)(state, first, inputs, ca.repmat(mm, 1, count))
-    return ca.Function("simulate", [mm, inputs], [seen]), ca.Function("slopes", [mm, inputs], [steep.T])
+    inputs = ca.MX.sym("inputs", nu, count)
+    given = [ca.MX.sym(name, e.shape[0]) for name, e in zip(("m", "nominal", "begin"), fixed, strict=True)]
+    at_start = ca.Function("at_start", fixed, [x0, ca.densify(ca.jacobian(x0, m))])
+    state, first = at_start(*given)
+    every = [ca.repmat(e, 1, count) for e in given]
+    _, seen = plain.mapaccum("values", count)(state, inputs, *every)
+    _, _, steep = with_slopes.mapaccum("slopes", count, 2)(state, first, inputs, *every)
+    simulate = ca.Function("simulate", [*given, inputs], [seen])
+    sloped = ca.Function("sloped", [*given, inputs], [steep.T])
+    if find_compiler() is None:
+        return simulate, sloped
+    try:
+        generator = ca.CodeGenerator("twin", {"with_header": False})
+        generator.add(simulate)
+        generator.add(sloped)
+        library = str(compile_library("twin", (generator.dump(),)))
+        return ca.external("simulate", library), ca.external("sloped", library)
+    except (RuntimeError, OSError) as error:
+        warnings.warn(f"the twin runs on the virtual machine, several times slower: {error}", RuntimeWarning, stacklevel=2)
+        return simulate, sloped
