@@ -38,12 +38,15 @@ class ChargingTwin:
     """Closed loops of ``problem`` on circuits whose R and C tables are the controller's own times exp(m).
 
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
-    nothing of the plant: it is centred on what the controller believes.
+    nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative) and ``soc_spread`` are
+    those of the capacity and of the SOC at the start, 0 where these are known.
     """
 
     problem: ChargingProblem
     spread: float = 0.4
     smooth: float = 0.3
+    capacity_spread: float = 0.0
+    soc_spread: float = 0.0
 
     @cached_property
     def twin(self) -> Twin:
@@ -55,9 +58,11 @@ class ChargingTwin:
         model = ecm_model(problem.plant_cell, problem.sampling_time_s).with_parameters(**{n: getattr(belief, n) for n in belief.tables})
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
-        unknowns = tuple(Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables)
+        unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
+        unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
+        unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         error = {name: LEAST_ERROR[name] for name in names}
-        return Twin(model, unknowns, noise, start_state(belief, problem.soc_start), error)
+        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
@@ -82,9 +87,10 @@ class ChargingTwin:
 
     def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64], error: OutputError | None = None) -> Episode | None:
         """One charge without noise, ``error`` added to what it measures."""
-        sizes = self.twin.model.parameter_blocks
+        sizes, own = self.twin.model.parameter_blocks, self._loop.plant
         values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
-        plant = replace(self._loop.plant, model=self._loop.plant.model.with_parameters(**dict(zip(sizes, values, strict=True))))
+        start = dict(zip(own.model.state_names, (float(v) for v in self.twin.start_state(unknowns)), strict=True))
+        plant = replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
         episode = replace(self._loop, plant=plant).run(theta)
         if episode.ending is not Ending.DONE:
             return None
