@@ -135,7 +135,8 @@ def rows(runs: list[dict[str, Any]], args: argparse.Namespace, attainable: dict[
                     "solved": int(sum(k and q <= WITHIN for k, q in zip(kept, ratios, strict=True))), "of": len(own),
                     "t95_ratio_median": _number(np.median(ratios)), "t95_ratio_worst": _number(np.max(ratios)),
                     "violating_trials": int(np.sum(excess > EXCESS_MV)), "all_trials": len(excess),
-                    "worst_excess_mV": float(np.max(excess)), "seeds_beyond_5_mV": far, "ask_s_median": float(np.median([r["ask_s"][count - 1] for r in own])),
+                    "worst_excess_mV": float(np.max(excess)), "seeds_beyond_5_mV": far,
+                    "ask_s_median": float(np.median([r["ask_s"][count - 1] for r in own])),
                 }
             )  # fmt: skip
     return found

@@ -1,0 +1,85 @@
+"""What a twin cannot represent: learnt where it was seen, doubted where it was not; and the ensemble's coverage."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from two_pairs import TwoPairs
+
+from chargetune.battery.cell import default_cell
+from chargetune.battery.charging import ChargingProblem, ResistanceRatio
+from chargetune.battery.twin import ChargingTwin
+from chargetune.learning.belief import believe
+from chargetune.learning.discrepancy import Discrepancy
+from chargetune.plants.sensors import Sensors
+
+CELL = default_cell()
+
+
+def charge(seed=1, *, pairs=False, **changes):
+    return ChargingProblem(
+        CELL, mismatch_seed=seed, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
+        plant_model=TwoPairs(CELL) if pairs else None, **changes,
+    )  # fmt: skip
+
+
+def beliefs(problem, ratios):
+    episodes = [problem.episode(np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
+    return believe(ChargingTwin(problem), [SimpleNamespace(episode=lambda e=e: e) for e in episodes]), episodes
+
+
+def drawn_voltages(belief, episode, count=48):
+    """Voltages at the recorded input of an episode on drawn plants, shape (count, K, 2)."""
+    out = []
+    for m, error in belief._plants(count, 3):
+        values = belief.loop.twin.predict(m, episode.input)[..., 0]
+        filled = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
+        column = episode.output_names.index("voltage_V")
+        filled.output_start[:, column], filled.output_end[:, column] = values[:, 0], values[:, 1]
+        out.append(np.stack(error(filled).signal("voltage_V"), axis=1))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("pairs", [False, True], ids=["a circuit", "a plant that the twin cannot be"])
+def test_intervals_cover_the_next_trial(pairs):
+    """90 % intervals of noisy samples of a third theta, after two others, cover 85 to 95 % of them."""
+    covered = []
+    for seed in range(4):
+        problem = charge(seed, pairs=pairs)
+        belief, _ = beliefs(problem, (4.0, 2.0))
+        following = problem.episode(np.full(9, 1.6), 10)
+        voltages = drawn_voltages(belief, following)
+        spread = np.sqrt(voltages.var(axis=0) + 0.002**2)
+        measured = np.stack(following.signal("voltage_V"), axis=1)
+        covered.append(np.mean(np.abs(measured - voltages.mean(axis=0)) < 1.645 * spread))
+    assert 0.85 < np.mean(covered) < 0.95
+
+
+def test_what_was_measured_is_reproduced_by_every_drawn_plant():
+    belief, episodes = beliefs(charge(pairs=True), (4.0, 1.6))
+    true = np.stack(episodes[-1].signal("voltage_V", true=True), axis=1)
+    off = np.sqrt(np.mean((drawn_voltages(belief, episodes[-1], 8) - true) ** 2, axis=(1, 2)))
+    assert np.max(off) < 3.5e-3
+
+
+def test_a_sample_is_surer_where_something_was_measured():
+    belief, episodes = beliefs(charge(pairs=True), (4.0,))
+    near = drawn_voltages(belief, episodes[0]).std(axis=0).mean()
+    far = drawn_voltages(belief, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    assert far > 3 * near
+
+
+def test_the_scale_grows_with_what_was_not_foretold():
+    scales = []
+    for pairs in (False, True):
+        problem = charge(pairs=pairs)
+        before, _ = beliefs(problem, (4.0,))
+        scales.append(before.discrepancy.foretold(problem.episode(np.full(9, 1.6), 7))[0])
+    assert scales[0] < 2.0 < scales[1]
+
+
+def test_features_are_one_to_three():
+    belief, episodes = beliefs(charge(steps=60), (4.0,))
+    with pytest.raises(ValueError, match="allowed are 1 to 3"):
+        Discrepancy(belief.posterior, tuple(episodes), {})
