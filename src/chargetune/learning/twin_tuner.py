@@ -31,7 +31,7 @@ ROUNDS = 7
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
-UNPROVED = 2.0
+UNPROVED = 1.5
 # Standard deviations that are taken back where nothing is promised; half of the plants would break a limit otherwise.
 CAUTION = 2.5
 # Factor on the deviations where that does not suffice.

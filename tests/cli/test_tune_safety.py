@@ -1,0 +1,74 @@
+"""`chargetune tune` with a table [safety]."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+STUDY = """
+[study]
+name = "safe"
+tuner = "{tuner}"
+trials = 3
+[controller]
+mismatch_seed = 1
+[sensors]
+voltage_noise_sd_V = 0.002
+[objective]
+verdict_samples = 5
+[theta.R0]
+lower = 0.1
+upper = 4.0
+[safety]
+{safety}
+"""
+
+
+def tune(folder, safety, tuner="twin", *options):
+    study = folder / "study.toml"
+    study.write_text(STUDY.format(tuner=tuner, safety=safety))
+    command = [sys.executable, "-m", "chargetune", "tune", str(study), "--store", str(folder / "s.sqlite"), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+
+
+def test_a_safe_study_says_what_it_promised_and_spent(tmp_path):
+    done = tune(tmp_path, "budget_mVs = 100.0", "twin", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["violating"] == 0
+    assert found["tuned"]["trial"] == 2
+    assert found["safety"] == {"probability": 0.95, "violation_mVs": 0.0, "budget_mVs": 100.0, "ended_at_a_limit": 0, "stopped": None}
+
+
+def test_an_unsafe_start_is_found_before_the_first_charge(tmp_path):
+    done = tune(tmp_path, "start = { R0_ratio = 0.5 }")
+    assert done.returncode == 2
+    assert "unsafe-start" in done.stderr
+    assert not (tmp_path / "s.sqlite").exists()
+
+
+def test_a_trial_ended_at_the_limit_spends_the_budget_and_stops_the_study(tmp_path):
+    done = tune(tmp_path, "start = { R0_ratio = 0.5 }\nbudget_mVs = 1.0\nabort_margin_V = 0.03", "twin", "--force", "--json")
+    assert done.returncode == 2
+    assert "the budget of violation is spent" in done.stderr
+    found = json.loads(done.stdout)
+    assert found["trials"] == 1
+    assert found["safety"]["ended_at_a_limit"] == 1
+    assert found["safety"]["violation_mVs"] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("safety", "tuner", "said"),
+    [
+        ("probability = 0.95", "default", "allowed is tuner = 'twin'"),
+        ("probability = 1.5", "twin", "probability = 1.5"),
+        ("budget_mVs = -1.0", "twin", "budget = -1.0"),
+        ("abort_margin_V = 0.0", "twin", "abort_margin_V = 0"),
+        ("start = { R0_rat = 2.0 }", "twin", "R0_rat"),
+    ],
+)
+def test_nonsense_is_refused_by_name(tmp_path, safety, tuner, said):
+    done = tune(tmp_path, safety, tuner)
+    assert done.returncode == 2
+    assert said in done.stderr
