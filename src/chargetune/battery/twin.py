@@ -29,6 +29,8 @@ __all__ = ["ChargingTwin"]
 LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05}
 # A circuit's prediction is off by at least about this where it was not measured.
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3}
+# Of the variance of that error, what an identified OCV leaves without current.
+OCV_SHARE = 0.3
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 
@@ -62,7 +64,9 @@ class ChargingTwin:
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         error = {name: LEAST_ERROR[name] for name in names}
-        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error)
+        # Of the cell's own circuit the OCV is known. Of another plant it was identified, worst near full.
+        at_rest = OCV_SHARE if problem.plant_model else 0.0
+        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:

@@ -32,8 +32,6 @@ NODES = {1: (101,), 2: (33, 15), 3: (25, 9, 6)}
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
-# Wrong resistances do little harm at a small input, a wrong rest does: this share of the variance at the largest input is left.
-AT_REST = 0.3
 # Neighbouring stretches that err together.
 TOGETHER = 4.0
 
@@ -154,7 +152,7 @@ class Discrepancy:
         both = np.vstack([self._places, lattice])
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(low + both * (high - low)) / np.maximum(np.abs(low), np.abs(high))
-        weight = np.maximum(sizes[:, inputs].max(axis=1), AT_REST) ** 0.5 if inputs else np.ones(len(both))
+        weight = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(both))
         return tuple(
             _part(
                 self._places,

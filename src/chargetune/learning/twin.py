@@ -68,7 +68,8 @@ class Twin:
 
     ``noise_sd`` maps the measured outputs to the standard deviation of one sample, ``start`` the states at the start of every
     trial to their nominal value (others are 0). ``error_sd`` is by how much at least an output may be off at the largest input
-    where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input. Raises
+    where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input, down to the
+    share ``error_at_rest`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does. Raises
     ValueError for what the model does not have.
     """
 
@@ -77,6 +78,7 @@ class Twin:
     noise_sd: Mapping[str, float]
     start: Mapping[str, float] = field(default_factory=dict)
     error_sd: Mapping[str, float] = field(default_factory=dict)
+    error_at_rest: float = 0.0
 
     def __post_init__(self) -> None:
         model = self.model
