@@ -11,12 +11,13 @@ from chargetune.battery.cell import Cell, default_cell
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import load_config
 from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.theta import Backoff, ResistanceRatio
 from chargetune.model.model import Model, Signal
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["PLANTS", "STUDIES", "StructuralPlant", "UnknownCell", "exact", "make_problem"]
+__all__ = ["DFN", "PLANTS", "STUDIES", "StructuralPlant", "UnknownCell", "exact", "make_problem"]
 
 # theta of each study: nine nodes of R0, eleven of a signed backoff, and the paper's backoff and R1.
 STUDIES = {
@@ -25,7 +26,9 @@ STUDIES = {
     "backoff": {"backoff": Backoff(lower_V=0.0, upper_V=0.2)},
     "model": {"ratios": (ResistanceRatio("R1"),)},
 }
-PLANTS = ("ecm", "unknown", "structural", "dfn")
+# PyBaMM's DFN by ambient temperature in K and largest current in A; the controller's circuit is that of the example.
+DFN = {"dfn": (298.15, 10.0), "dfn-283K": (283.15, 10.0), "dfn-3C": (298.15, 15.0)}
+PLANTS = ("ecm", "unknown", "structural", *DFN)
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_fast_charge.toml"
 
 
@@ -86,9 +89,8 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
     if plant not in PLANTS or study not in STUDIES:
         raise ValueError(f"plant = {plant!r}, study = {study!r}; allowed are {', '.join(PLANTS)} and {', '.join(STUDIES)}")
     sensors = Sensors(noise_sd={"voltage_V": noise_V}) if noise_V else Sensors()
-    if plant == "dfn":
-        config = load_config(EXAMPLE)
-        return replace(config.problem(EXAMPLE.parent), sensors=sensors)
+    if plant in DFN:
+        return _dfn(*DFN[plant], study, sensors)
     cell = default_cell()
     problem = ChargingProblem(cell, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **STUDIES[study])  # type: ignore[arg-type]
     if plant == "structural":
@@ -99,6 +101,18 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
         draw = np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, 3) * (0.05, 0.02, 0.005)
         return replace(problem, plant_model=UnknownCell(cell, *(float(v) for v in draw)))
     return problem
+
+
+def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors) -> ChargingProblem:
+    """Voltage limit alone, SOC measured, overpotential by the controller's own model; the seed decides the noise and nothing else."""
+    problem = load_config(EXAMPLE).problem(EXAMPLE.parent)
+    cell, plant = problem.plant_cell, problem.plant_model
+    if cell.thermal is None or not isinstance(plant, Electrochemical):
+        raise TypeError(f"{EXAMPLE.name} is to describe a cell with a temperature and an electrochemical plant")
+    return ChargingProblem(
+        replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, verdict_samples=5,
+        current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **STUDIES[study],  # type: ignore[arg-type]
+    )  # fmt: skip
 
 
 def exact(problem: ChargingProblem) -> ChargingProblem:
