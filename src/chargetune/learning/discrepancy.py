@@ -172,7 +172,6 @@ class _Part:
 
     gain: NDArray[np.float64]
     root: NDArray[np.float64]
-    amplitude: float
 
 
 def _part(
@@ -205,7 +204,7 @@ def _part(
     gain = cho_solve(seen, whole[:n, n:]).T
     rest = whole[n:, n:] - gain @ whole[:n, n:]
     values, vectors = np.linalg.eigh((rest + rest.T) / 2)
-    return _Part(gain, vectors * np.sqrt(np.maximum(values, 0.0)), float(np.sqrt(whole[0, 0])))
+    return _Part(gain, vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
