@@ -3,8 +3,12 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from chargetune.battery.config import load_config
+from chargetune.battery.reproduce import make_tuner
 
 STUDY = """
 [study]
@@ -72,3 +76,14 @@ def test_nonsense_is_refused_by_name(tmp_path, safety, tuner, said):
     done = tune(tmp_path, safety, tuner)
     assert done.returncode == 2
     assert said in done.stderr
+
+
+def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
+    study = tmp_path / "plated.toml"
+    example = Path(__file__).parents[2] / "examples"
+    text = (example / "dfn_fast_charge.toml").read_text().replace('tuner = "default"', 'tuner = "twin"')
+    study.write_text(text.replace('"okane2022.toml"', f'"{example / "okane2022.toml"}"') + "\n[safety]\nprobability = 0.9\n")
+    config = load_config(study)
+    problem = config.problem(tmp_path)
+    with pytest.raises(ValueError, match=r"anode_min_V, which the cell's circuit does not predict"):
+        make_tuner(config.study.tuner, 0, problem, config.safety)

@@ -41,14 +41,20 @@ def make_tuner(
     # torch is needed from here on only.
     from chargetune import learning
 
+    twin = ChargingTwin(problem)
+    if safety and twin.unpredicted:
+        raise ValueError(
+            f"[safety] is given with the limits {', '.join(twin.unpredicted)}, which the cell's circuit does not predict: "
+            "allowed are limits whose table ([thermal], [anode]) the cell file has"
+        )
     first = None if start is None else tuple(float(v) for v in start)
     safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
     makers: dict[str, Callable[[int], Proposer]] = {
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
         "sobol": lambda s: learning.Sobol(seed=s),
-        "envelope": lambda _: learning.Envelope(ChargingTwin(problem)),
-        "twin": lambda s: learning.TwinTuner(ChargingTwin(problem), seed=s, safety=safe),
+        "envelope": lambda _: learning.Envelope(twin),
+        "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging_check import stand_in
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
-from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
@@ -113,19 +113,13 @@ class ChargingTwin:
 
     @cached_property
     def _exact(self) -> ChargingProblem:
-        # Limits that a circuit cannot predict are nothing it could be tuned on.
-        problem, cell = self.problem, self.problem.plant_cell
-        return replace(
-            problem,
-            plant_model=None,
-            abort_margin_V=None,
-            abort_margin_K=None,
-            soc_windows=WINDOWS,
-            verdict_samples=1,
-            sensors=Sensors(),
-            temperature_max_K=problem.temperature_max_K if cell.thermal else None,
-            anode_min_V=problem.anode_min_V if cell.anode else None,
-        )
+        return replace(stand_in(self.problem), soc_windows=WINDOWS)
+
+    @property
+    def unpredicted(self) -> tuple[str, ...]:
+        """Limits of the problem that the circuit does not predict: nothing is known of them before they are tried."""
+        known = {limit.name for limit in self._exact.limits}
+        return tuple(limit.name for limit in self.problem.limits if limit.name not in known)
 
     @cached_property
     def _loop(self) -> CompiledEpisode:
