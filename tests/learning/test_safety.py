@@ -70,6 +70,13 @@ def test_the_first_theta_is_the_declared_one_or_the_corner_that_is_safe():
         TwinTuner(ChargingTwin(problem), safety=Safety(start=(9.0,) * 9)).ask(problem.space, [])
 
 
+def test_a_trial_without_a_trace_teaches_nothing_and_the_start_is_proposed_again():
+    problem, declared = charge(), tuple(np.full(9, 2.5))
+    lost = SimpleNamespace(number=0, theta=declared, status="failed", score=None, episode=None)
+    proposed = TwinTuner(ChargingTwin(problem), safety=Safety(start=declared)).ask(problem.space, [lost])
+    np.testing.assert_array_equal(proposed, [declared])
+
+
 def test_a_spent_budget_stops_before_anything_is_proposed():
     problem = charge(noise=0.0)
     score, episode, _ = problem(problem.space.default, 0)

@@ -107,11 +107,12 @@ class TwinTuner:
 
     def _safe(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> NDArray[np.float64]:
         belief = believe(self.loop, trials)
-        if not trials:
+        if belief.discrepancy is None:
+            # Trials that left no trace have taught nothing.
             return self._start(space, belief, safety)
         self._check_budget(trials, safety)
         seed = self.seed + 7919 * len(trials)
-        proved = len(episodes_of(trials)) > 1
+        proved = len(belief.discrepancy.episodes) > 1
         deviations = float(norm.ppf(safety.probability)) + (TOGETHER if proved else TOGETHER + UNPROVED)
         # What the plant would allow if the belief were true: from there on caution only takes back.
         theta, passed = self._covered(belief, np.array(trials[-1].theta)), []
