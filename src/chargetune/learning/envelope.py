@@ -138,12 +138,11 @@ def covering(
     episode: Episode,
     theta: NDArray[np.float64],
     measured: NDArray[np.float64],
-    margin: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.float64]:
     """The theta with which the controller's predictions cover what was measured on this episode, and not much more.
 
         min   mean_k c_k(theta') + UNCOVERED mean_k t_k + moving sum_i |theta'_i - theta_i| / range_i
-        s.t.  c_k(theta') >= e_k + margin - t_k,  t_k >= 0,  theta' in its bounds
+        s.t.  c_k(theta') >= e_k - t_k,  t_k >= 0,  theta' in its bounds
 
     In an interval whose input was at its bound, and which kept the limit nevertheless, only max(0, c_k(theta')) counts.
 
@@ -155,10 +154,9 @@ def covering(
     near, full = _near(controller, measured), _at_bound(controller, episode, theta)
     for _ in range(LINEARISATIONS):
         rows, slopes = predicted_rows(controller, episode, theta)
-        beyond = measured + margin
         # Where the input is at its bound the limit does not decide it: there the prediction only has to stay below.
-        idle = full[:, None, None] & (beyond <= 0)
-        wanted = np.where(near, np.where(idle, 0.0, beyond) - rows, np.nan).ravel()
+        idle = full[:, None, None] & (measured <= 0)
+        wanted = np.where(near, np.where(idle, 0.0, measured) - rows, np.nan).ravel()
         free = np.broadcast_to(idle, rows.shape).ravel()
         steep = slopes.reshape(wanted.size, -1)
         known = np.isfinite(wanted) & np.all(np.isfinite(steep), axis=1)
