@@ -116,7 +116,7 @@ def hold(path, connection):
 def test_a_second_process_is_refused_until_the_first_is_dead(store):
     open_study(store, "other").close()
     here, there = FORK.Pipe()
-    process = FORK.Process(target=hold, args=(store.path, there))
+    process = FORK.Process(target=hold, args=(store.location, there))
     process.start()
     holder = here.recv()
     with pytest.raises(StudyError, match=rf"study 'toy' is held by process {holder} on .* since "):
@@ -181,7 +181,7 @@ def alive(pid):
 
 def test_workers_do_not_outlive_a_killed_study(store, tmp_path):
     here, there = FORK.Pipe()
-    process = FORK.Process(target=start_workers, args=(store.path, there))
+    process = FORK.Process(target=start_workers, args=(store.location, there))
     process.start()
     workers = here.recv()
     assert len(set(workers)) == 2
@@ -212,7 +212,7 @@ def until_ctrl_c(path, connection):
 
 def test_ctrl_c_of_the_whole_process_group_stops_between_trials(store):
     here, there = FORK.Pipe()
-    process = FORK.Process(target=until_ctrl_c, args=(store.path, there))
+    process = FORK.Process(target=until_ctrl_c, args=(store.location, there))
     process.start()
     assert here.recv() in {0, 1}
     os.killpg(process.pid, signal.SIGINT)

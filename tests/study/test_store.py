@@ -30,7 +30,7 @@ def finish(store, study, number, score=SCORE, ending="done", trace=TRACE):
 
 
 def raw(store, *statements):
-    with closing(sqlite3.connect(store.path, isolation_level=None)) as connection:
+    with closing(sqlite3.connect(store.location, isolation_level=None)) as connection:
         return [connection.execute(*s) if isinstance(s, tuple) else connection.execute(s) for s in statements][-1].fetchall()
 
 
@@ -60,7 +60,7 @@ def test_what_is_told_is_read_back_after_reopening(store):
     finish(store, study, 0)
     finish(store, study, 1, score=None, ending="RuntimeError: x", trace=None)
     store.close()
-    with Store(store.path, read_only=True) as again:
+    with Store(store.location, read_only=True) as again:
         assert [(r.name, r.trial_count, r.identity) for r in again.studies()] == [("a", 2, {"config": CONFIG})]
         done, failed = again.trials(study)
         assert (done.status, done.score, done.theta, done.ending, done.seed) == (TrialStatus.DONE, SCORE, (0.0, 1.0), "done", 0)
@@ -213,8 +213,8 @@ def test_no_folder(tmp_path, read_only):
 
 def test_newer_schema_is_refused(store):
     raw(store, "UPDATE chargetune_store SET schema_version = 99")
-    with pytest.raises(StoreError, match=r"schema version 99, this program knows versions up to 1"):
-        Store(store.path)
+    with pytest.raises(StoreError, match=r"schema version 99, this program knows versions up to 2"):
+        Store(store.location)
 
 
 def test_folder_without_write_permission(public):
@@ -235,7 +235,7 @@ def test_folder_without_write_permission(public):
 
 def test_read_only_reads_while_another_writes_and_changes_nothing(store):
     study = a_study(store)
-    with Store(store.path, read_only=True) as reader:
+    with Store(store.location, read_only=True) as reader:
         finish(store, study, 0)
         assert reader.trials(study)[0].status == "done"
         for change in (lambda: finish(reader, study, 1), lambda: reader.add_study("b", {}), lambda: open_study(reader)):
@@ -247,7 +247,7 @@ def test_read_only_reads_while_another_writes_and_changes_nothing(store):
 def test_long_lock_ends_in_a_message_that_names_the_holder(tmp_path):
     with Store(tmp_path / "s.db", busy_timeout_s=0.2) as store, open_study(store) as study:
         trial = study.ask()[0]
-        with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
+        with closing(sqlite3.connect(store.location, isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
             start = time.monotonic()
             with pytest.raises(StoreError, match=rf"locked by another process.*last holder: process {os.getpid()} on "):
@@ -265,10 +265,10 @@ def test_commits_are_on_the_disk(store):
 
 
 def test_leftover_of_a_killed_creation_is_no_second_name_of_the_store(store):
-    leftover = store.path.with_name(f".other.db.{os.getpid()}.new")
-    leftover.hardlink_to(store.path)
+    leftover = Path(store.location).with_name(f".other.db.{os.getpid()}.new")
+    leftover.hardlink_to(store.location)
     a_study(store)
-    with Store(store.path.with_name("other.db")) as other:
+    with Store(Path(store.location).with_name("other.db")) as other:
         assert other.studies() == []
     assert [r.name for r in store.studies()] == ["a"]
     assert not leftover.exists()
@@ -285,12 +285,12 @@ def test_two_thousand_trials_list_fast(store):
     store.add_trials(record.id, [Trial(k, theta, provenance={"versions": {"numpy": "2.0"}}) for k in range(2000)])
     text = '{"excess":{"v":0.1},"metrics":{"t80_min":null},"objective":1.0,"performance":1.0,"tolerance":{"v":0.0}}'
     blob = os.urandom(20_000)
-    with closing(sqlite3.connect(store.path)) as connection:
+    with closing(sqlite3.connect(store.location)) as connection:
         connection.execute("UPDATE trial SET status = 'done', score = ?", (text,))
-        connection.executemany("INSERT INTO trace VALUES (?, ?, ?)", [(record.id, k, blob) for k in range(2000)])
+        connection.executemany("INSERT INTO trace (study_id, number, data) VALUES (?, ?, ?)", [(record.id, k, blob) for k in range(2000)])
         connection.commit()
     start = time.process_time()
-    with Store(store.path, read_only=True) as reader:
+    with Store(store.location, read_only=True) as reader:
         trials = reader.trials(record.id)
     assert len(trials) == 2000
     assert trials[-1].score is not None
@@ -303,7 +303,7 @@ def test_a_study_of_the_toy_is_whole_in_the_file(store):
         for trial in study.trials():
             assert (study.trace(trial.number) is None) == (trial.status == "failed")
         before = essence(study.trials())
-    with Store(store.path, read_only=True) as reader:
+    with Store(store.location, read_only=True) as reader:
         assert essence(reader.trials(reader.study("toy").id)) == before
         assert reader.study("toy").identity["tuner"] == {"type": "Halfway", "seed": 3}
     assert Halfway().ask(SPACE, []).shape == (1, 2)

@@ -1,14 +1,16 @@
 import json
+import struct
 import time
 from contextlib import suppress
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from chargetune.study.trace import MAGIC, decode, encode
+from chargetune.study.trace import MAGIC, TraceFacts, content_sha256, decode, encode, facts
 
 DTYPES = st.sampled_from(["<f8", ">f8", "<f4", "<i8", "<i4", "u1", "?", "<u8", "<f2"])
 ARRAYS = DTYPES.flatmap(lambda d: hnp.arrays(d, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=7)))
@@ -63,15 +65,49 @@ def test_damage_is_a_value_error_or_another_valid_trace(position, byte):
         decode(bytes(data))
 
 
+def forged(header, content=b""):
+    text = json.dumps(header).encode()
+    return MAGIC + zstandard.compress(struct.pack("<I", len(text)) + text + content)
+
+
 @pytest.mark.parametrize("dtype", ["O", "<f8,<f8", "<U8", "(", "f8", "<c16", "<M8", "__import__('os')"])
 def test_dtypes_that_are_never_written_are_not_read(dtype):
-    data = encode({"a": np.arange(3.0)}, {"pad": ""})
-    # The padding keeps the length of the header, so that only the dtype is wrong.
-    longer = encode({"a": np.arange(3.0)}, {"pad": "x" * (len(dtype) - 3)}) if len(dtype) > 3 else data
-    other = data.replace(b'"<f8"', json.dumps(dtype).encode() + b" " * (3 - len(dtype)))
-    other = other[: len(MAGIC)] + longer[len(MAGIC) : len(MAGIC) + 4] + other[len(MAGIC) + 4 :]
+    entry = {"name": "a", "dtype": "<f8", "shape": [3], "filter": "raw"}
+    assert decode(forged({"arrays": [entry], "meta": {}}, bytes(24)))[0]["a"].tolist() == [0.0] * 3
     with pytest.raises(ValueError, match=r"dtype .* is not allowed"):
-        decode(other)
+        decode(forged({"arrays": [entry | {"dtype": dtype}], "meta": {}}, bytes(24)))
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (zstandard.compress(bytes(1 << 20)).replace(struct.pack("<I", 1 << 20), struct.pack("<I", 1 << 31)), "allowed is at most"),
+        (zstandard.ZstdCompressor(write_content_size=False).compress(bytes(100)), "allowed is at most"),
+        (zstandard.compress(struct.pack("<I", 0)) + b"x", "damaged"),
+        (zstandard.compress(struct.pack("<I", 1 << 31)), "damaged"),
+        (zstandard.compress(b""), "damaged"),
+    ],
+)
+def test_lengths_that_lie_are_refused(frame, message):
+    with pytest.raises(ValueError, match=message):
+        decode(MAGIC + frame)
+
+
+def test_facts_are_those_of_the_content_not_of_its_compression():
+    meta = {"sampling_time_s": 10, "input_names": ["i"], "input_units": ["A"], "output_names": ["v"], "output_units": ["V"]}
+    data = encode({"v": np.arange(3.0)}, meta)
+    known = facts(data)
+    assert (known.units, known.sampling_time_s) == ({"i": "A", "v": "V"}, 10.0)
+    other = MAGIC + zstandard.ZstdCompressor(level=19, write_checksum=True).compress(zstandard.decompress(data[len(MAGIC) :]))
+    assert other != data
+    assert facts(other) == known
+    for arrays, changed in (
+        ({"v": np.array([0.0, 1.0, -0.0])}, meta),
+        ({"w": np.arange(3.0)}, meta),
+        ({"v": np.arange(3.0)}, meta | {"a": 1}),
+    ):
+        assert facts(encode(arrays, changed)).sha256 != known.sha256
+    assert facts(encode({}, {"units": {"v": "mV"}})) == TraceFacts(content_sha256({}, {"units": {"v": "mV"}}), {"v": "mV"}, None)
 
 
 @pytest.mark.parametrize("cut", [0, 5, 20, 60, -1])

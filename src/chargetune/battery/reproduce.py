@@ -134,11 +134,11 @@ def seed_run(store: Store, name: str, trials: int | None = None) -> SeedRun:
     def episode(trial: Trial) -> Episode:
         trace = store.trace(record.id, trial.number)
         if trace is None:
-            raise ValueError(f"{store.path}: trial {trial.number} of study {name!r} has no trace")
+            raise ValueError(f"{store.label}: trial {trial.number} of study {name!r} has no trace")
         return Episode.from_arrays(*trace)
 
     if not listed or listed[0].score is None:
-        raise ValueError(f"{store.path}: study {name!r} has no finished untuned run (trial 0)")
+        raise ValueError(f"{store.label}: study {name!r} has no finished untuned run (trial 0)")
     return SeedRun(
         problem=problem_of_document(record.identity["config"]),
         trials=listed,

@@ -264,7 +264,7 @@ def main() -> None:
         # Import only now: these modules are heavy, and are loaded already when one of them raised.
         from chargetune.study.identity import StudyError
         from chargetune.study.runner import WorkerError
-        from chargetune.study.sqlite import StoreError
+        from chargetune.study.records import StoreError
 
         if not isinstance(error, (StudyError, StoreError, WorkerError)):
             raise

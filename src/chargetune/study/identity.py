@@ -9,7 +9,7 @@ from typing import Any
 
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import canonical_json, describe, differences, space_to_json
-from chargetune.study.store import StudyRecord
+from chargetune.study.records import StudyRecord
 
 __all__ = ["StudyError", "check_change", "study_identity"]
 
@@ -21,7 +21,9 @@ class StudyError(Exception):
     """A study cannot begin, resume or go on; the message says why and what can be done."""
 
 
-def study_identity(name: str, *, config: Mapping[str, Any], space: ParameterSpace, tuner: object, seed: int, batch: int) -> dict[str, Any]:
+def study_identity(
+    name: str, *, config: Mapping[str, Any], space: ParameterSpace, tuner: object, seed: int, batch: int, hardware: bool = False
+) -> dict[str, Any]:
     """The identity as JSON data. Raises ValueError naming the argument, its value and what is allowed."""
     if not NAME.fullmatch(name):
         raise ValueError(
@@ -33,6 +35,8 @@ def study_identity(name: str, *, config: Mapping[str, Any], space: ParameterSpac
     if space.dimension == 0:
         raise ValueError("space: no parameters, allowed is at least one")
     identity = {"config": config, "space": space_to_json(space), "tuner": describe(tuner), "seed": seed, "batch": batch}
+    # Only where it is so, that studies of before this entry resume.
+    identity |= {"hardware": True} if hardware else {}
     plain: dict[str, Any] = json.loads(canonical_json(identity, "study"))
     return plain
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 
-__all__ = ["utc_now", "versions"]
+__all__ = ["made_by", "utc_now", "versions"]
 
 PACKAGES = ("chargetune", "numpy", "casadi", "torch", "botorch", "gpytorch", "pybamm")
 
@@ -31,3 +31,8 @@ def _versions() -> tuple[tuple[str, str], ...]:
 def versions() -> dict[str, str]:
     """Versions of Python, of this program and of the numerical packages that are installed; nothing is imported."""
     return dict(_versions())
+
+
+def made_by() -> str:
+    """This program and its version."""
+    return f"chargetune {versions().get('chargetune', '(not installed)')}"

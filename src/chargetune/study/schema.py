@@ -5,6 +5,7 @@ from __future__ import annotations
 from sqlalchemy import (
     BigInteger,
     Column,
+    Float,
     ForeignKey,
     ForeignKeyConstraint,
     Integer,
@@ -18,14 +19,16 @@ from sqlalchemy import (
 
 __all__ = ["SCHEMA_VERSION", "holder", "metadata", "store", "study", "trace", "trial"]
 
-SCHEMA_VERSION = 1
+# 1: the first; 2: traces as zstd, attempts, terms of the holder, hardware
+SCHEMA_VERSION = 2
 
 metadata = MetaData()
 
+# One row for each version the store has had.
 store = Table(
     "chargetune_store",
     metadata,
-    Column("schema_version", Integer, primary_key=True),
+    Column("schema_version", Integer, primary_key=True, autoincrement=False),
     Column("created_at", String(40), nullable=False),
     Column("created_by", Text, nullable=False),
 )
@@ -39,8 +42,10 @@ study = Table(
     Column("identity", Text, nullable=False),  # JSON: config, space, tuner, seed, batch
     Column("identity_sha256", String(64), nullable=False),
     Column("versions", Text, nullable=False),  # JSON, of the programs that created the study
+    Column("hardware", Integer, nullable=False, server_default="0"),  # 1: a trial is handed out at most once
 )
 
+# Numbers below 0 are D_0: told trials of earlier studies, imported when the study began.
 trial = Table(
     "trial",
     metadata,
@@ -55,6 +60,9 @@ trial = Table(
     Column("told_at", String(40)),
     Column("trace_sha256", String(64)),
     Column("provenance", Text, nullable=False),
+    Column("attempt", Integer, nullable=False, server_default="0"),
+    Column("worker", Text),
+    Column("handed_out_at", String(40)),
     PrimaryKeyConstraint("study_id", "number"),
 )
 
@@ -65,16 +73,19 @@ trace = Table(
     Column("study_id", Integer, nullable=False),
     Column("number", Integer, nullable=False),
     Column("data", LargeBinary, nullable=False),
+    Column("units", Text, nullable=False, server_default="{}"),  # JSON: unit by signal
+    Column("sampling_time_s", Float),
     PrimaryKeyConstraint("study_id", "number"),
     ForeignKeyConstraint(["study_id", "number"], ["trial.study_id", "trial.number"]),
 )
 
-# Who works on a study, for people to read. The lock itself is the operating system's, see lease.py.
+# Who works on a study. The lock itself is the operating system's or the server's; the term tells apart who held it when.
 holder = Table(
     "holder",
     metadata,
-    Column("study_id", ForeignKey("study.id"), primary_key=True),
+    Column("study_id", ForeignKey("study.id"), primary_key=True, autoincrement=False),
     Column("process", Integer, nullable=False),
     Column("host", Text, nullable=False),
     Column("since", String(40), nullable=False),
+    Column("term", Integer, nullable=False, server_default="0"),
 )

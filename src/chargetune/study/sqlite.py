@@ -4,34 +4,108 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, insert
-from sqlalchemy.exc import DatabaseError
+from sqlalchemy.exc import DatabaseError, DBAPIError
 from sqlalchemy.pool import QueuePool
 
 from chargetune.study import schema
-from chargetune.study.provenance import utc_now, versions
+from chargetune.study.lease import Lease, take_lease
+from chargetune.study.migrate import migrate, stored_version
+from chargetune.study.provenance import made_by, utc_now
+from chargetune.study.records import StoreError
 
-__all__ = ["BEGIN_WRITING", "StoreError", "connect_engine", "create_file", "explain"]
-
-BEGIN_WRITING = "BEGIN IMMEDIATE"
-
-
-class StoreError(Exception):
-    """The store cannot be used, or refuses what was asked; the message names the file and the reason."""
+__all__ = ["SqliteFile"]
 
 
-def create_file(path: Path, *, read_only: bool) -> None:
-    """Make an empty store at ``path`` unless there is a file; StoreError when there can be none."""
-    try:
-        if not _is_there(path, read_only=read_only):
-            _create(path)
-    except DatabaseError as error:
-        raise StoreError(explain(path, error)) from error
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be opened or created ({error.strerror})") from error
+@dataclass(frozen=True)
+class SqliteFile:
+    """A store in one file: WAL, synchronous FULL, immediate transactions."""
+
+    path: Path
+
+    @property
+    def location(self) -> str:
+        """What opens the same store again."""
+        return str(self.path)
+
+    @property
+    def label(self) -> str:
+        """The path."""
+        return str(self.path)
+
+    def prepare(self, *, read_only: bool, busy_timeout_s: float) -> None:
+        """Make an empty store unless there is a file, and bring an old one to this schema; StoreError when there can be none."""
+        try:
+            if not _is_there(self.path, read_only=read_only):
+                _create(self.path)
+                return
+            engine = self.connect(read_only=read_only, busy_timeout_s=busy_timeout_s)
+            try:
+                with engine.connect() as connection:
+                    self._check(connection, read_only=read_only)
+                migrate(engine, self.path)
+            finally:
+                engine.dispose()
+        except DatabaseError as error:
+            raise StoreError(self.explain(error)) from error
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be opened or created ({error.strerror})") from error
+
+    def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
+        """An engine on the file; a transaction with the execution option ``writing`` takes the write lock when it begins."""
+        return connect_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
+
+    def damage(self, connection: Connection, *, full: bool = False) -> str:
+        """What SQLite's own check finds, of the whole file or of all but the traces; empty when it finds nothing."""
+        if full:
+            rows = connection.exec_driver_sql("PRAGMA integrity_check").scalars().all()
+            return "" if rows == ["ok"] else "; ".join(str(row) for row in rows)
+        # Traces are checked by their hash when read: going over all of them would take seconds at each start.
+        for table in (t.name for t in schema.metadata.sorted_tables if t is not schema.trace):
+            verdict = connection.exec_driver_sql(f"PRAGMA quick_check('{table}')").scalar()
+            if verdict != "ok":
+                return str(verdict)
+        return ""
+
+    def explain(self, error: DBAPIError) -> str:
+        """What a database error means for the person at the keyboard."""
+        return explain(self.path, error)
+
+    def lost(self, error: DBAPIError) -> bool:
+        """Never: there is no connection to lose."""
+        return False
+
+    def hold(self, study_id: int) -> Lease | None:
+        """Lock the study's byte of the lock file beside the store."""
+        try:
+            return take_lease(self.path, study_id)
+        except OSError as error:
+            raise StoreError(f"{self.path}-lock: cannot be opened or locked ({error.strerror})") from error
+
+    def _check(self, connection: Connection, *, read_only: bool) -> None:
+        tables = {str(row[0]) for row in connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if schema.store.name not in tables:
+            raise StoreError(f"{self.path}: a database, but not a store of this program (no table {schema.store.name})")
+        version = stored_version(connection)
+        if version is None or version > schema.SCHEMA_VERSION:
+            raise StoreError(
+                f"{self.path}: schema version {version}, this program knows versions up to {schema.SCHEMA_VERSION};"
+                " open it with the newer program that wrote it"
+            )
+        damage = self.damage(connection)
+        if damage:
+            raise StoreError(
+                f"{self.path}: damaged, nothing was changed ({damage}); `chargetune store salvage` saves what can be read into a new file"
+            )
+        if version < schema.SCHEMA_VERSION and read_only:
+            raise StoreError(
+                f"{self.path}: schema version {version}, this program reads version {schema.SCHEMA_VERSION};"
+                f" `chargetune store migrate {self.path}` converts it and keeps the old file"
+            )
 
 
 def _is_there(path: Path, *, read_only: bool) -> bool:
@@ -58,12 +132,11 @@ def _create(path: Path) -> None:
         engine = connect_engine(aside, read_only=False, busy_timeout_s=0.0, mode="rwc")
         try:
             # The one statement that must stand outside of a transaction. The mode stays with the file.
-            with engine.connect().execution_options(begin=None) as connection:
+            with engine.connect().execution_options(autocommit=True) as connection:
                 connection.exec_driver_sql("PRAGMA journal_mode=WAL")
-            with engine.execution_options(begin=BEGIN_WRITING).begin() as connection:
+            with engine.execution_options(writing=True).begin() as connection:
                 schema.metadata.create_all(connection)
-                made_by = f"chargetune {versions().get('chargetune', '(not installed)')}"
-                values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by}
+                values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by()}
                 connection.execute(insert(schema.store).values(values))
         finally:
             engine.dispose()
@@ -78,7 +151,7 @@ def _create(path: Path) -> None:
 
 
 def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: str = "rw") -> Engine:
-    """An engine on the file; ``execution_options(begin=BEGIN_WRITING)`` takes the write lock at the beginning of a transaction."""
+    """An engine on the file; ``execution_options(writing=True)`` takes the write lock at the beginning of a transaction."""
     query = "mode=ro" if read_only else f"mode={mode}"
     writable = os.access(path.parent, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
     if read_only and not writable and not path.with_name(path.name + "-wal").exists():
@@ -99,14 +172,14 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
 
     @event.listens_for(engine, "begin")
     def begin(connection: Connection) -> None:
-        statement = connection.get_execution_options().get("begin", "BEGIN")
-        if statement is not None:
-            connection.exec_driver_sql(statement)
+        options = connection.get_execution_options()
+        if not options.get("autocommit"):
+            connection.exec_driver_sql("BEGIN IMMEDIATE" if options.get("writing") else "BEGIN")
 
     return engine
 
 
-def explain(path: Path, error: DatabaseError) -> str:
+def explain(path: Path, error: DBAPIError) -> str:
     """What a database error means for the person at the keyboard."""
     reason = str(error.orig)
     code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF

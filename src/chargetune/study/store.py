@@ -1,69 +1,67 @@
-"""Store: studies, trials and traces in one SQLite file that survives a crash at any moment."""
+"""Store: studies, trials and traces in an SQLite file or on a PostgreSQL server; it survives a crash at any moment."""
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, func, insert, select, update
-from sqlalchemy.exc import DatabaseError, IntegrityError
+from sqlalchemy import Connection, func, insert, select, update
+from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from chargetune.episode.score import Score
 from chargetune.study import schema
-from chargetune.study.document import canonical_json, score_from_json, score_to_json, sha256
+from chargetune.study.database import Hold, database_at
+from chargetune.study.document import canonical_json, sha256
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.sqlite import BEGIN_WRITING, StoreError, connect_engine, create_file, explain
-from chargetune.study.trace import decode
+from chargetune.study.records import StoreError, StudyRecord, record_of, result_of, trial_of, trial_row
+from chargetune.study.trace import content_sha256, decode, facts
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["Store", "StoreError", "StudyRecord"]
 
-
-@dataclass(frozen=True)
-class StudyRecord:
-    """A study as it is stored. ``identity`` is JSON with the entries config, space, tuner, seed and batch."""
-
-    id: int
-    name: str
-    created_at: str
-    identity: Mapping[str, Any]
-    identity_sha256: str
-    versions: Mapping[str, str]
-    trial_count: int = 0
+T = TypeVar("T")
+PAUSE_S = 0.2
 
 
 class Store:
-    """An open store file; several studies live in one.
+    """An open store; several studies live in one.
 
-    Every change is one transaction, on the disk when the method returns (WAL, synchronous FULL, immediate transactions). A second
-    writer waits at most ``busy_timeout_s`` seconds. With ``read_only`` nothing is created or changed.
+    location
+        The path of an SQLite file, or ``postgresql://user@host/database``.
+    busy_timeout_s
+        How long a writer waits for another one, and how long a lost connection to a server is tried again.
 
-    Raises StoreError, before anything is written, for a path that cannot be a store: folder missing, no write permission, a
-    directory, not a store, damaged, written by a newer version. A damaged file is never recreated.
+    Every change is one transaction, on the disk when the method returns. With ``read_only`` nothing is created or changed.
+    A store of an older schema is brought to this one, after a copy of the file was made.
+
+    Raises StoreError, before anything is written, for what cannot be a store: folder missing, no write permission, a
+    directory, not a store, damaged, written by a newer version, no such server. A damaged file is never recreated.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False, busy_timeout_s: float = 10.0) -> None:
-        self.path = Path(path).resolve()
-        self.read_only = read_only
+    def __init__(self, location: str | os.PathLike[str], *, read_only: bool = False, busy_timeout_s: float = 10.0) -> None:
         if not busy_timeout_s >= 0:
             raise ValueError(f"busy_timeout_s = {busy_timeout_s!r}, allowed is a number of seconds >= 0")
-        create_file(self.path, read_only=read_only)
-        self._engine = connect_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
-        try:
-            self._check()
-        except BaseException:
-            self._engine.dispose()
-            raise
+        self.database = database_at(location)
+        self.location = self.database.location
+        self.label = self.database.label
+        self.read_only = read_only
+        self.busy_timeout_s = busy_timeout_s
+        self.database.prepare(read_only=read_only, busy_timeout_s=busy_timeout_s)
+        self._engine = self.database.connect(read_only=read_only, busy_timeout_s=busy_timeout_s)
+        if not read_only:
+            try:
+                self._write(lambda _: None)
+            except BaseException:
+                self._engine.dispose()
+                raise
 
     def close(self) -> None:
-        """Close the file. A crash instead of it loses nothing."""
+        """Close the store. A crash instead of it loses nothing."""
         self._engine.dispose()
 
     def __enter__(self) -> Self:
@@ -74,10 +72,10 @@ class Store:
 
     def studies(self) -> list[StudyRecord]:
         """All studies, oldest first, with the number of their trials."""
-        count = select(func.count()).where(schema.trial.c.study_id == schema.study.c.id).scalar_subquery()
-        with self._reading() as connection:
-            rows = connection.execute(select(schema.study, count.label("trial_count")).order_by(schema.study.c.id)).all()
-        return [_record(row) for row in rows]
+        own = (schema.trial.c.study_id == schema.study.c.id, schema.trial.c.number >= 0)
+        count = select(func.count()).where(*own).correlate(schema.study).scalar_subquery()
+        query = select(schema.study, count.label("trial_count")).order_by(schema.study.c.id)
+        return [record_of(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
     def study(self, name: str) -> StudyRecord:
         """The study of this name; StoreError names those that there are."""
@@ -85,193 +83,258 @@ class Store:
         for record in records:
             if record.name == name:
                 return record
-        raise StoreError(f"{self.path}: no study {name!r}; there are: {', '.join(r.name for r in records) or '(none)'}")
+        raise StoreError(f"{self.label}: no study {name!r}; there are: {', '.join(r.name for r in records) or '(none)'}")
 
     def trials(self, study_id: int) -> list[Trial]:
-        """All trials of a study by number, without their traces."""
-        with self._reading() as connection:
-            rows = connection.execute(select(schema.trial).where(schema.trial.c.study_id == study_id).order_by(schema.trial.c.number)).all()
-        return [_trial(row) for row in rows]
+        """All trials of a study by number, without their traces and without the imported ones."""
+        return self._trials(study_id, schema.trial.c.number >= 0)
+
+    def earlier(self, study_id: int) -> list[Trial]:
+        """D_0 of a study: the trials of earlier studies that it began with; their numbers are below 0."""
+        return self._trials(study_id, schema.trial.c.number < 0)
 
     def trace(self, study_id: int, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
         """Arrays and metadata of a trial's episode, None when none was stored.
 
-        Raises StoreError when the bytes are not those that were stored; the other trials stay readable.
+        Raises StoreError when the content is not what was stored; the other trials stay readable.
         """
         where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
-        joined = schema.trial.outerjoin(schema.trace)
-        with self._reading() as connection:
-            row = connection.execute(select(schema.trial.c.trace_sha256, schema.trace.c.data).select_from(joined).where(*where)).first()
+        query = select(schema.trial.c.trace_sha256, schema.trace.c.data).select_from(schema.trial.outerjoin(schema.trace)).where(*where)
+        row = self._read(lambda connection: connection.execute(query).first())
         if row is None:
-            raise StoreError(f"{self.path}: no trial {number} in this study")
+            raise StoreError(f"{self.label}: no trial {number} in this study")
         if row.trace_sha256 is None:
             return None
-        if row.data is None or sha256(row.data) != row.trace_sha256:
-            raise StoreError(f"{self.path}: the trace of trial {number} is damaged (its SHA-256 is not the stored one)")
-        return decode(row.data)
+        damaged = f"{self.label}: the trace of trial {number} is damaged"
+        if row.data is None:
+            raise StoreError(f"{damaged} (it is missing)")
+        try:
+            arrays, meta = decode(bytes(row.data))
+        except ValueError as error:
+            raise StoreError(f"{damaged} ({error})") from error
+        if content_sha256(arrays, meta) != row.trace_sha256:
+            raise StoreError(f"{damaged} (its SHA-256 is not the stored one)")
+        return arrays, meta
 
-    def add_study(self, name: str, identity: Mapping[str, Any]) -> StudyRecord:
-        """Record a new study."""
-        text = canonical_json(identity, "study")
+    def add_study(
+        self, name: str, identity: Mapping[str, Any], *, hardware: bool = False, earlier: Sequence[tuple[Trial, bytes | None]] = ()
+    ) -> StudyRecord:
+        """Record a new study and D_0: told trials with numbers below 0, each with its encoded trace or None."""
+        identity_text = canonical_json(identity, "study")
         values = {
             "name": name,
             "created_at": utc_now(),
-            "identity": text,
-            "identity_sha256": sha256(text),
+            "identity": identity_text,
+            "identity_sha256": sha256(identity_text),
             "versions": canonical_json(versions(), "versions"),
+            "hardware": int(hardware),
         }
-        with self._writing() as connection:
-            if connection.execute(select(schema.study.c.id).where(schema.study.c.name == name)).first():
-                raise StoreError(f"{self.path}: there is a study {name!r} already")
+
+        def add(connection: Connection) -> None:
+            found = connection.execute(select(schema.study).where(schema.study.c.name == name)).first()
+            if found is not None:
+                # The same to the millisecond: this very transaction, whose answer was lost.
+                if (found.created_at, found.identity) == (values["created_at"], values["identity"]):
+                    return
+                raise StoreError(f"{self.label}: there is a study {name!r} already")
             connection.execute(insert(schema.study).values(values))
+            study_id = connection.execute(select(schema.study.c.id).where(schema.study.c.name == name)).scalar_one()
+            for trial, trace in earlier:
+                connection.execute(insert(schema.trial).values(study_id=study_id, **trial_row(trial)))
+                _add_trace(connection, study_id, trial.number, trace)
+
+        self._write(add)
         return self.study(name)
 
-    def change_study(self, study_id: int, identity: Mapping[str, Any]) -> None:
+    def change_study(self, study_id: int, identity: Mapping[str, Any], *, term: int | None = None) -> None:
         """Replace what a study is about; the trials so far keep the hash of the old one in their provenance."""
         text = canonical_json(identity, "study")
-        values = {"identity": text, "identity_sha256": sha256(text)}
-        with self._writing() as connection:
-            connection.execute(update(schema.study).where(schema.study.c.id == study_id).values(values))
+        query = update(schema.study).where(schema.study.c.id == study_id).values(identity=text, identity_sha256=sha256(text))
+        self._write(lambda connection: connection.execute(query), study_id, term)
 
-    def add_trials(self, study_id: int, trials: Sequence[Trial]) -> None:
+    def add_trials(self, study_id: int, trials: Sequence[Trial], *, term: int | None = None) -> None:
         """Record trials as running, all or none. Their numbers must go on where the stored ones end."""
-        with self._writing() as connection:
-            count = connection.execute(select(func.count()).where(schema.trial.c.study_id == study_id)).scalar_one()
+        rows = [{"study_id": study_id, **trial_row(trial)} for trial in trials]
+        own = (schema.trial.c.study_id == study_id, schema.trial.c.number >= 0)
+
+        def add(connection: Connection) -> None:
+            stored = connection.execute(select(schema.trial).where(*own).order_by(schema.trial.c.number)).all()
             numbers = [trial.number for trial in trials]
-            if numbers != list(range(count, count + len(trials))):
-                raise StoreError(f"{self.path}: trial numbers {numbers} do not follow the {count} stored ones")
-            connection.execute(insert(schema.trial), [{"study_id": study_id, **_values(trial)} for trial in trials])
+            if numbers == list(range(len(stored), len(stored) + len(trials))):
+                connection.execute(insert(schema.trial), rows)
+            elif [trial_of(row) for row in stored[-len(trials) :]] != list(trials):
+                # Equal ones are this very transaction, whose answer was lost.
+                raise StoreError(f"{self.label}: trial numbers {numbers} do not follow the {len(stored)} stored ones")
+
+        self._write(add, study_id, term)
+
+    def hand_out(self, study_id: int, trials: Sequence[Trial], worker: str, *, term: int | None = None) -> list[Trial]:
+        """Record, before they begin, that ``worker`` evaluates running trials; gives them with the number of this attempt.
+
+        The attempt before is given up: its result is refused from now on. Raises StoreError, and hands out none, for a trial
+        that is told, or that somebody else handed out since it was read; and for one of a study on hardware that was handed out
+        before, because it may have run.
+        """
+        tried = False
+
+        def hand(connection: Connection) -> list[Trial]:
+            nonlocal tried
+            again, tried = tried, True
+            hardware = connection.execute(select(schema.study.c.hardware).where(schema.study.c.id == study_id)).scalar()
+            handed = []
+            for trial in trials:
+                where = (schema.trial.c.study_id == study_id, schema.trial.c.number == trial.number)
+                row = connection.execute(select(schema.trial).where(*where)).first()
+                if row is None or row.status != TrialStatus.RUNNING:
+                    raise StoreError(f"{self.label}: trial {trial.number} is not running, nothing is handed out")
+                if not (again and row.attempt == trial.attempt + 1 and row.worker == worker):
+                    if hardware and row.attempt:
+                        raise StoreError(
+                            f"{self.label}: trial {trial.number} was handed out to {row.worker} at {row.handed_out_at} and may have run;"
+                            " on hardware that happens once. Look at the cell, then tell its result or fail it"
+                        )
+                    if row.attempt != trial.attempt:
+                        raise StoreError(
+                            f"{self.label}: trial {trial.number} was handed out to {row.worker} at {row.handed_out_at} already"
+                        )
+                    values = {"attempt": trial.attempt + 1, "worker": worker, "handed_out_at": utc_now()}
+                    connection.execute(update(schema.trial).where(*where).values(values))
+                handed.append(replace(trial_of(row), attempt=trial.attempt + 1))
+            return handed
+
+        return self._write(hand, study_id, term)
 
     def finish_trial(
-        self, study_id: int, number: int, *, score: Score | None, ending: str, trace: bytes | None, provenance: Mapping[str, Any]
+        self,
+        study_id: int,
+        number: int,
+        *,
+        score: Score | None,
+        ending: str,
+        trace: bytes | None,
+        provenance: Mapping[str, Any],
+        attempt: int | None = None,
+        term: int | None = None,
     ) -> Trial:
         """Record the result of a running trial (no score: it failed) and its trace in one transaction.
 
-        Telling the same result twice changes nothing and gives the stored trial; another result raises StoreError.
+        ``attempt`` is the one that the result comes from; None speaks for whatever attempt there is.
+        Telling the same result twice changes nothing and gives the stored trial; another result, or that of an attempt that
+        was given up, raises StoreError.
         """
         where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
-        with self._writing() as connection:
+        hashed = None if trace is None else facts(trace).sha256
+
+        def finish(connection: Connection) -> Trial:
             row = connection.execute(select(schema.trial).where(*where)).first()
-            if row is None:
-                raise StoreError(f"{self.path}: no trial {number} in this study, ask comes before tell")
-            stored = _trial(row)
+            if row is None or number < 0:
+                raise StoreError(f"{self.label}: no trial {number} in this study, ask comes before tell")
+            stored = trial_of(row)
             told = replace(
                 stored,
                 status=TrialStatus.FAILED if score is None else TrialStatus.DONE,
                 score=score,
                 ending=ending,
                 told_at=utc_now(),
-                trace_sha256=None if trace is None else sha256(trace),
+                trace_sha256=hashed,
                 provenance=provenance,
             )
             if stored.status is not TrialStatus.RUNNING:
-                if _result(stored) == _result(told):
+                if result_of(stored) == result_of(told):
                     return stored
-                raise StoreError(f"{self.path}: trial {number} is {stored.status} already, with another result")
-            if trace is not None:
-                connection.execute(insert(schema.trace).values(study_id=study_id, number=number, data=trace))
-            connection.execute(update(schema.trial).where(*where).values(_values(told)))
-        return told
+                raise StoreError(f"{self.label}: trial {number} is {stored.status} already, with another result")
+            if attempt is not None and attempt != stored.attempt:
+                raise StoreError(
+                    f"{self.label}: trial {number}: attempt {attempt} was given up, its late result is refused; attempt {stored.attempt}"
+                    f" is with {row.worker} since {row.handed_out_at}"
+                )
+            _add_trace(connection, study_id, number, trace)
+            connection.execute(update(schema.trial).where(*where).values(trial_row(told)))
+            return told
 
-    def note_holder(self, study_id: int, process: int, host: str) -> None:
-        """Record who works on a study, for the message to whoever is refused."""
+        return self._write(finish, study_id, term)
+
+    def hold(self, study_id: int) -> Hold | None:
+        """Take a study for this process, None when another process has it."""
+        if self.read_only:
+            raise StoreError(f"{self.label}: opened read-only")
+        return self.database.hold(study_id)
+
+    def note_holder(self, study_id: int, process: int, host: str) -> int:
+        """Record who works on a study, for the message to whoever is refused; gives the number of this term.
+
+        With it, writing refuses whoever held the study before.
+        """
         values = {"process": process, "host": host, "since": utc_now()}
-        with self._writing() as connection:
-            if not connection.execute(update(schema.holder).where(schema.holder.c.study_id == study_id).values(values)).rowcount:
-                connection.execute(insert(schema.holder).values(study_id=study_id, **values))
+        where = schema.holder.c.study_id == study_id
+
+        def note(connection: Connection) -> int:
+            term: int | None = connection.execute(select(schema.holder.c.term).where(where)).scalar()
+            if term is None:
+                connection.execute(insert(schema.holder).values(study_id=study_id, term=1, **values))
+                return 1
+            connection.execute(update(schema.holder).where(where).values(term=term + 1, **values))
+            return term + 1
+
+        return self._write(note)
 
     def holder(self, study_id: int | None = None) -> str:
         """The process noted last, for one study or for any, as text."""
         query = select(schema.holder).order_by(schema.holder.c.since.desc())
         if study_id is not None:
             query = query.where(schema.holder.c.study_id == study_id)
-        with self._reading() as connection:
-            row = connection.execute(query).first()
+        row = self._read(lambda connection: connection.execute(query).first())
         return "unknown" if row is None else f"process {row.process} on {row.host} since {row.since}"
 
-    def _check(self) -> None:
-        with self._reading() as connection:
-            tables = {str(row[0]) for row in connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")}
-            if schema.store.name not in tables:
-                raise StoreError(f"{self.path}: a database, but not a store of this program (no table {schema.store.name})")
-            version = connection.execute(select(func.max(schema.store.c.schema_version))).scalar()
-            if version is None or version > schema.SCHEMA_VERSION:
-                raise StoreError(
-                    f"{self.path}: schema version {version}, this program knows versions up to {schema.SCHEMA_VERSION};"
-                    " open it with the newer program that wrote it"
-                )
-            # Traces are checked by their hash when read: going over all of them would take seconds at each start.
-            for table in (t.name for t in schema.metadata.sorted_tables if t is not schema.trace):
-                verdict = connection.exec_driver_sql(f"PRAGMA quick_check('{table}')").scalar()
-                if verdict != "ok":
-                    raise StoreError(f"{self.path}: damaged, nothing was changed ({verdict})")
-        if not self.read_only:
-            with self._writing():
-                pass
+    def _trials(self, study_id: int, which: Any) -> list[Trial]:
+        query = select(schema.trial).where(schema.trial.c.study_id == study_id, which).order_by(schema.trial.c.number)
+        return [trial_of(row) for row in self._read(lambda connection: connection.execute(query).all())]
 
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        try:
+    def _read(self, action: Callable[[Connection], T]) -> T:
+        def once() -> T:
             with self._engine.connect() as connection:
-                yield connection
-        except DatabaseError as error:
-            raise StoreError(explain(self.path, error)) from error
+                return action(connection)
 
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
+        return self._persist(once)
+
+    def _write(self, action: Callable[[Connection], T], study_id: int | None = None, term: int | None = None) -> T:
+        """Run ``action`` as one transaction; more than once when a connection is lost, so it must bear repetition."""
         if self.read_only:
-            raise StoreError(f"{self.path}: opened read-only")
-        try:
-            with self._engine.execution_options(begin=BEGIN_WRITING).begin() as connection:
-                yield connection
-        except IntegrityError as error:
-            raise StoreError(f"{self.path}: refused by the store ({error.orig})") from error
-        except DatabaseError as error:
-            message = explain(self.path, error)
-            raise StoreError(f"{message}; last holder: {self.holder()}" if "is locked" in message else message) from error
+            raise StoreError(f"{self.label}: opened read-only")
+
+        def once() -> T:
+            with self._engine.execution_options(writing=True).begin() as connection:
+                if term is not None:
+                    row = connection.execute(select(schema.holder).where(schema.holder.c.study_id == study_id)).first()
+                    if row is None or row.term != term:
+                        by = "nobody" if row is None else f"process {row.process} on {row.host} since {row.since}"
+                        raise StoreError(
+                            f"{self.label}: this study was taken over by {by}; nothing is written on behalf of its former holder"
+                        )
+                return action(connection)
+
+        return self._persist(once)
+
+    def _persist(self, once: Callable[[], T]) -> T:
+        until = time.monotonic() + self.busy_timeout_s
+        while True:
+            try:
+                return once()
+            except IntegrityError as error:
+                raise StoreError(f"{self.label}: refused by the store ({error.orig})") from error
+            except DBAPIError as error:
+                if self.database.lost(error) and time.monotonic() < until:
+                    time.sleep(PAUSE_S)
+                    continue
+                message = self.database.explain(error)
+                if "is locked" in message:
+                    message += f"; last holder: {self.holder()}"
+                raise StoreError(message) from error
 
 
-def _values(trial: Trial) -> dict[str, Any]:
-    return {
-        "number": trial.number,
-        "theta": canonical_json(trial.theta, "theta"),
-        "status": str(trial.status),
-        "score": None if trial.score is None else canonical_json(score_to_json(trial.score), "score"),
-        "ending": trial.ending,
-        "seed": trial.seed,
-        "asked_at": trial.asked_at,
-        "told_at": trial.told_at,
-        "trace_sha256": trial.trace_sha256,
-        "provenance": canonical_json(trial.provenance, "provenance"),
-    }
-
-
-def _result(trial: Trial) -> tuple[object, ...]:
-    return (trial.status, None if trial.score is None else score_to_json(trial.score), trial.ending, trial.trace_sha256)
-
-
-def _trial(row: Row[Any]) -> Trial:
-    return Trial(
-        number=row.number,
-        theta=tuple(json.loads(row.theta)),
-        status=TrialStatus(row.status),
-        score=None if row.score is None else score_from_json(json.loads(row.score)),
-        ending=row.ending,
-        seed=row.seed,
-        asked_at=row.asked_at,
-        told_at=row.told_at,
-        trace_sha256=row.trace_sha256,
-        provenance=json.loads(row.provenance),
-    )
-
-
-def _record(row: Row[Any]) -> StudyRecord:
-    return StudyRecord(
-        id=row.id,
-        name=row.name,
-        created_at=row.created_at,
-        identity=json.loads(row.identity),
-        identity_sha256=row.identity_sha256,
-        versions=json.loads(row.versions),
-        trial_count=row.trial_count,
-    )
+def _add_trace(connection: Connection, study_id: int, number: int, trace: bytes | None) -> None:
+    if trace is None:
+        return
+    known = facts(trace)
+    values = {"data": trace, "units": canonical_json(known.units, "units"), "sampling_time_s": known.sampling_time_s}
+    connection.execute(insert(schema.trace).values(study_id=study_id, number=number, **values))

@@ -21,10 +21,10 @@ from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import score_to_json
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.identity import StudyError, check_change, study_identity
-from chargetune.study.lease import Lease, take_lease
+from chargetune.study.database import Hold
 from chargetune.study.provenance import utc_now, versions
 from chargetune.study.runner import WorkerError, check_crosses, outcomes
-from chargetune.study.store import Store, StoreError, StudyRecord
+from chargetune.study.store import Store, StudyRecord
 from chargetune.study.trace import Traceable, encode
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 
@@ -55,7 +55,8 @@ class Study:
     tuner: Proposer
     seed: int
     batch: int
-    lease: Lease
+    lease: Hold
+    term: int
 
     @classmethod
     def create_or_resume(
@@ -68,30 +69,33 @@ class Study:
         tuner: Proposer,
         seed: int = 0,
         batch: int = 1,
+        hardware: bool = False,
         accept_changed: bool = False,
     ) -> Self:
         """The study ``name`` of the store, begun if there is none.
 
         config
             JSON data that says what an evaluation does. It is compared on resume, together with space, tuner, seed and batch.
+        hardware
+            The plant is no simulation: a trial is handed out at most once and never repeated by the program.
         accept_changed
             Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units.
 
         Raises ValueError for bad arguments; StudyError when what is resumed differs, or when another process holds the study.
         """
-        identity = study_identity(name, config=config, space=space, tuner=tuner, seed=seed, batch=batch)
-        record = next((r for r in store.studies() if r.name == name), None) or store.add_study(name, identity)
+        identity = study_identity(name, config=config, space=space, tuner=tuner, seed=seed, batch=batch, hardware=hardware)
+        record = next((r for r in store.studies() if r.name == name), None) or store.add_study(name, identity, hardware=hardware)
         lease = _take_lease(store, record)
         try:
             record = store.study(name)
             if check_change(record, identity, accept_changed=accept_changed):
                 store.change_study(record.id, identity)
                 record = store.study(name)
-            store.note_holder(record.id, os.getpid(), socket.gethostname())
+            term = store.note_holder(record.id, os.getpid(), socket.gethostname())
         except BaseException:
             lease.release()
             raise
-        return cls(store, record, space, tuner, seed, batch, lease)
+        return cls(store, record, space, tuner, seed, batch, lease, term)
 
     def close(self) -> None:
         """Give the study back, so that another process can go on with it. The store stays open."""
@@ -151,23 +155,37 @@ class Study:
         thetas = self._propose(before, self.batch)[len(trials) - first :]
         return self._record(len(trials), thetas[:count])
 
-    def tell(self, number: int, score: Score, episode: Traceable | None = None, *, ending: str = "done") -> Trial:
+    def hand_out(self, trials: Sequence[Trial], worker: str = "") -> list[Trial]:
+        """Record that these running trials begin now, and where; gives them with the number of this attempt.
+
+        The attempt before is given up: its late result is refused. Raises StoreError for a trial that is told or was handed out
+        since it was read, and for one on hardware that was handed out before.
+        """
+        return self.store.hand_out(self.record.id, trials, worker or f"process {os.getpid()} on {socket.gethostname()}", term=self.term)
+
+    def tell(
+        self, number: int, score: Score, episode: Traceable | None = None, *, ending: str = "done", attempt: int | None = None
+    ) -> Trial:
         """Record the score of a running trial and its trace in one transaction. Telling the same again changes nothing.
+
+        ``attempt`` is that of `hand_out`; None speaks for whatever attempt there is.
 
         Raises ValueError for a score with anything but finite numbers; StoreError for an unknown trial or a different second result.
         """
         score_to_json(score)
-        return self.finish(number, score, None if episode is None else encode(episode.arrays(), episode.meta()), ending)
+        return self.finish(number, score, None if episode is None else encode(episode.arrays(), episode.meta()), ending, attempt=attempt)
 
-    def fail(self, number: int, reason: str, episode: Traceable | None = None) -> Trial:
+    def fail(self, number: int, reason: str, episode: Traceable | None = None, *, attempt: int | None = None) -> Trial:
         """Record that a running trial failed, why, and what trace there is. As safe to repeat as `tell`."""
-        return self.finish(number, None, None if episode is None else encode(episode.arrays(), episode.meta()), reason)
+        return self.finish(number, None, None if episode is None else encode(episode.arrays(), episode.meta()), reason, attempt=attempt)
 
-    def finish(self, number: int, score: Score | None, trace: bytes | None, ending: str) -> Trial:
+    def finish(self, number: int, score: Score | None, trace: bytes | None, ending: str, *, attempt: int | None = None) -> Trial:
         """Record an outcome whose trace is encoded already; no score means that the trial failed."""
         if not isinstance(ending, str) or not ending:
             raise ValueError(f"ending = {ending!r}, allowed is a non-empty string")
-        return self.store.finish_trial(self.record.id, number, score=score, ending=ending, trace=trace, provenance=self._provenance())
+        return self.store.finish_trial(
+            self.record.id, number, score=score, ending=ending, trace=trace, provenance=self._provenance(), attempt=attempt, term=self.term
+        )
 
     def run(
         self,
@@ -179,10 +197,10 @@ class Study:
     ) -> Trial | None:
         """Evaluate until the study has ``trials`` told trials, and return the best feasible one.
 
-        Trials that a dead process left running are evaluated first, again, with the same theta and seed: ``evaluate`` must be a
-        simulation. What it raises makes that trial failed and the study goes on. ``executor`` belongs to the caller, None evaluates
-        in this process. ``progress`` receives the trial told last, the best feasible trial, the number of done trials that broke a
-        limit and the number of failed trials.
+        Trials that a dead process left running are evaluated first, again, with the same theta and seed; on hardware that is
+        refused (StoreError) for one that was handed out. What ``evaluate`` raises makes that trial failed and the study goes on.
+        ``executor`` belongs to the caller, None evaluates in this process. ``progress`` receives the trial told last, the best
+        feasible trial, the number of done trials that broke a limit and the number of failed trials.
 
         On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt passes on; the same call resumes.
         Raises ValueError for bad arguments, WorkerError when a worker process dies.
@@ -196,14 +214,16 @@ class Study:
         failures = sum(t.status is TrialStatus.FAILED for t in known)
         todo = [t for t in known if t.status is TrialStatus.RUNNING] or self.ask_batch(trials)
         while todo:
-            with closing(outcomes(evaluate, todo, executor)) as finished:
-                for trial, outcome in finished:
-                    told = self.finish(trial.number, outcome.score, outcome.trace, outcome.ending)
-                    incumbent = best_feasible([t for t in (incumbent, told) if t is not None])
-                    violating += told.score is not None and not told.score.feasible
-                    failures += told.status is TrialStatus.FAILED
-                    if progress is not None:
-                        progress(told, incumbent, violating, failures)
+            # Here one begins when the one before is told, and is handed out then: a crash concerns it alone.
+            for some in [[t] for t in todo] if executor is None else [todo]:
+                with closing(outcomes(evaluate, self.hand_out(some), executor)) as finished:
+                    for trial, outcome in finished:
+                        told = self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt)
+                        incumbent = best_feasible([t for t in (incumbent, told) if t is not None])
+                        violating += told.score is not None and not told.score.feasible
+                        failures += told.status is TrialStatus.FAILED
+                        if progress is not None:
+                            progress(told, incumbent, violating, failures)
             todo = self.ask_batch(trials)
         return incumbent
 
@@ -229,18 +249,15 @@ class Study:
             Trial(number, theta, seed=trial_seed(self.seed, number), asked_at=now, provenance=made_with)
             for number, theta in enumerate(thetas, start=first)
         ]
-        self.store.add_trials(self.record.id, trials)
+        self.store.add_trials(self.record.id, trials, term=self.term)
         return trials
 
     def _provenance(self) -> dict[str, Any]:
         return {"study_sha256": self.record.identity_sha256, "versions": versions()}
 
 
-def _take_lease(store: Store, record: StudyRecord) -> Lease:
-    try:
-        lease = take_lease(store.path, record.id)
-    except OSError as error:
-        raise StoreError(f"{store.path}-lock: cannot be opened or locked ({error.strerror})") from error
+def _take_lease(store: Store, record: StudyRecord) -> Hold:
+    lease = store.hold(record.id)
     if lease is None:
-        raise StudyError(f"{store.path}: study {record.name!r} is held by {store.holder(record.id)}; end that process, or wait for it")
+        raise StudyError(f"{store.label}: study {record.name!r} is held by {store.holder(record.id)}; end that process, or wait for it")
     return lease

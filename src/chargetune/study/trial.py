@@ -25,7 +25,7 @@ class Trial:
     """One theta that was asked for, and what became of it.
 
     number
-        Order of asking, from 0, without gaps.
+        Order of asking, from 0, without gaps. Below 0: a trial of an earlier study, imported as initial data D_0.
     theta
         Values in the order of ``ParameterSpace.entries``, in their own units.
     score
@@ -40,6 +40,8 @@ class Trial:
         SHA-256 of the stored trace, None when there is none.
     provenance
         Hash of the study's configuration, versions of the programs, machine.
+    attempt
+        How often the trial was handed out to a worker; the result of an attempt before the last one is refused.
     episode
         Reads the trial's stored episode; a study gives it to its tuner, nobody else has it.
     """
@@ -54,11 +56,12 @@ class Trial:
     told_at: str | None = None
     trace_sha256: str | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    attempt: int = 0
     episode: Callable[[], Any] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.number < 0:
-            raise ValueError(f"trial: number = {self.number}, allowed is an integer >= 0")
+        if self.number < 0 and self.status is TrialStatus.RUNNING:
+            raise ValueError(f"trial: number = {self.number}, allowed is an integer >= 0; below 0 are told trials of earlier studies")
         if (self.score is not None) != (self.status is TrialStatus.DONE):
             raise ValueError(f"trial {self.number}: status = {self.status}, a score belongs to the status 'done' and only to it")
 

@@ -1,0 +1,76 @@
+"""What a store needs of the database below it, and which database a location means."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Protocol
+
+from sqlalchemy import Connection, Engine
+from sqlalchemy.exc import DBAPIError
+
+from chargetune.study.records import StoreError
+from chargetune.study.sqlite import SqliteFile
+
+__all__ = ["Database", "Hold", "database_at"]
+
+
+class Hold(Protocol):
+    """A study that this process holds until it is released or the process ends."""
+
+    def release(self) -> None:
+        """Give the study back."""
+        ...
+
+
+class Database(Protocol):
+    """SQLite file or PostgreSQL server. A transaction with the execution option ``writing`` is the only one of its kind at a time."""
+
+    @property
+    def location(self) -> str:
+        """What opens it again."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """How messages name it; without a password."""
+        ...
+
+    def prepare(self, *, read_only: bool, busy_timeout_s: float) -> None:
+        """Make an empty store where there is nothing yet, and bring an old one to this schema. Raises StoreError."""
+        ...
+
+    def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
+        """An engine for the store that `prepare` left."""
+        ...
+
+    def damage(self, connection: Connection, *, full: bool = False) -> str:
+        """What a quick or a full check of the database finds; empty when it finds nothing."""
+        ...
+
+    def explain(self, error: DBAPIError) -> str:
+        """What a database error means for a person."""
+        ...
+
+    def lost(self, error: DBAPIError) -> bool:
+        """Whether the connection broke, so that the transaction may or may not have been stored."""
+        ...
+
+    def hold(self, study_id: int) -> Hold | None:
+        """Take a study for this process; None when another process has it."""
+        ...
+
+
+def database_at(location: str | os.PathLike[str]) -> Database:
+    """The database of a path or of a URL ``postgresql://user@host/database``. Raises StoreError for another URL."""
+    text = os.fspath(location)
+    scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]*)://", text)
+    if scheme is None:
+        return SqliteFile(Path(text).resolve())
+    if scheme[1] not in ("postgresql", "postgres"):
+        raise StoreError(f"store {scheme[0]}...: allowed are the path of a file and postgresql://user@host/database")
+    # Only here: the driver is an extra.
+    from chargetune.study.postgres import server_at
+
+    return server_at(text)
