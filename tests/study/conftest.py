@@ -14,3 +14,9 @@ from chargetune.study.store import Store
 def store(tmp_path):
     with Store(tmp_path / "s.db") as opened:
         yield opened
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def location(request, tmp_path):
+    """Where a store can be: what holds for one kind must hold for the other."""
+    return str(tmp_path / "s.db") if request.param == "sqlite" else request.getfixturevalue("postgres")

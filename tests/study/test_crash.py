@@ -17,7 +17,6 @@ from study_toy import Toy, essence, open_study
 from chargetune.study.executors import process_executor
 from chargetune.study.lease import take_lease
 from chargetune.study.store import Store
-from chargetune.study.study import StudyError
 
 # A fork starts in a millisecond, so that the kills fall into the work and not into the imports.
 FORK = multiprocessing.get_context("fork")
@@ -105,26 +104,6 @@ def test_kill_inside_a_transaction(tmp_path, statement, studies, running, traces
             assert connection.exec_driver_sql("SELECT count(*) FROM trace").scalar() == traces
         study.run(Toy(), 3)
         assert [t.number for t in study.trials()] == [0, 1, 2]
-
-
-def hold(path, connection):
-    with Store(path) as store, open_study(store):
-        connection.send(os.getpid())
-        connection.recv()
-
-
-def test_a_second_process_is_refused_until_the_first_is_dead(store):
-    open_study(store, "other").close()
-    here, there = FORK.Pipe()
-    process = FORK.Process(target=hold, args=(store.location, there))
-    process.start()
-    holder = here.recv()
-    with pytest.raises(StudyError, match=rf"study 'toy' is held by process {holder} on .* since "):
-        open_study(store)
-    open_study(store, "other").close()
-    process.kill()
-    process.join()
-    open_study(store).close()
 
 
 def try_lease(path, connection):

@@ -13,7 +13,7 @@ from study_toy import CONFIG, SPACE, Halfway, Toy, essence, open_study
 from chargetune.episode.score import Score
 from chargetune.study.store import Store, StoreError
 from chargetune.study.trace import encode
-from chargetune.study.trial import Trial, TrialStatus
+from chargetune.study.trial import Trial
 
 SCORE = Score(-1.0, -1.5, {"v": 0.1}, {"v": 0.0}, {"t80_min": None})
 TRACE = encode({"v": np.arange(5.0)}, {"unit": "V"})
@@ -55,65 +55,6 @@ def public():
     shutil.rmtree(folder)
 
 
-def test_what_is_told_is_read_back_after_reopening(store):
-    study = a_study(store)
-    finish(store, study, 0)
-    finish(store, study, 1, score=None, ending="RuntimeError: x", trace=None)
-    store.close()
-    with Store(store.location, read_only=True) as again:
-        assert [(r.name, r.trial_count, r.identity) for r in again.studies()] == [("a", 2, {"config": CONFIG})]
-        done, failed = again.trials(study)
-        assert (done.status, done.score, done.theta, done.ending, done.seed) == (TrialStatus.DONE, SCORE, (0.0, 1.0), "done", 0)
-        assert (failed.status, failed.score, failed.ending, failed.trace_sha256) == (TrialStatus.FAILED, None, "RuntimeError: x", None)
-        assert done.provenance == {"by": "test"}
-        arrays, meta = again.trace(study, 0)
-        np.testing.assert_array_equal(arrays["v"], np.arange(5.0))
-        assert meta == {"unit": "V"}
-        assert again.trace(study, 1) is None
-
-
-def test_studies_of_one_file_are_apart(store):
-    a, b = a_study(store, 2, "a"), a_study(store, 3, "b")
-    finish(store, b, 1)
-    assert [t.status for t in store.trials(a)] == ["running"] * 2
-    assert [t.status for t in store.trials(b)] == ["running", "done", "running"]
-    with pytest.raises(StoreError, match="a study 'a' already"):
-        a_study(store, 1, "a")
-    with pytest.raises(StoreError, match="no study 'c'; there are: a, b"):
-        store.study("c")
-
-
-def test_theta_and_score_keep_every_bit(store):
-    values = (0.1 + 0.2, 1e-308, -0.0, np.nextafter(1.0, 2.0))
-    study = store.add_study("a", {}).id
-    store.add_trials(study, [Trial(0, values)])
-    score = Score(values[0], values[3], {"v": values[1]}, {"v": values[2]})
-    finish(store, study, 0, score=score)
-    (trial,) = store.trials(study)
-    assert [v.hex() for v in trial.theta] == [float(v).hex() for v in values]
-    assert trial.score == score
-
-
-def test_tell_twice(store):
-    study = a_study(store)
-    first = finish(store, study, 0)
-    assert finish(store, study, 0) == first
-    for change in ({"score": None}, {"ending": "other"}, {"trace": None}, {"score": Score(-1.0, -1.5, {}, {})}):
-        with pytest.raises(StoreError, match="trial 0 is done already, with another result"):
-            finish(store, study, 0, **change)
-    assert store.trials(study)[0] == first
-    with pytest.raises(StoreError, match="no trial 7"):
-        finish(store, study, 7)
-
-
-@pytest.mark.parametrize("numbers", [[0], [3], [2, 2], [2, 4], [3, 2]])
-def test_numbers_go_on_without_gaps_or_nothing_is_stored(store, numbers):
-    study = a_study(store, 2)
-    with pytest.raises(StoreError, match="do not follow the 2 stored"):
-        store.add_trials(study, [Trial(k, (0.0,)) for k in numbers])
-    assert len(store.trials(study)) == 2
-
-
 @pytest.mark.parametrize("when", ["BEFORE INSERT ON trace", "AFTER INSERT ON trace", "BEFORE UPDATE ON trial", "AFTER UPDATE ON trial"])
 def test_trace_and_result_are_stored_both_or_neither(store, when):
     study = a_study(store)
@@ -141,20 +82,6 @@ def test_full_disk_loses_nothing_and_the_result_can_be_told_again(store):
         connection.exec_driver_sql("PRAGMA max_page_count=1000000")
     finish(store, study, 1, trace=big)
     assert store.trace(study, 1)[0]["v"].size == 200_000
-
-
-def test_damaged_trace_is_that_trials_trouble_only(store):
-    study = a_study(store)
-    finish(store, study, 0)
-    finish(store, study, 1)
-    raw(store, ("UPDATE trace SET data = ? WHERE number = 0", (TRACE[:-1] + b"?",)))
-    with pytest.raises(StoreError, match="trace of trial 0 is damaged"):
-        store.trace(study, 0)
-    raw(store, "DELETE FROM trace WHERE number = 0")
-    with pytest.raises(StoreError, match="trace of trial 0 is damaged"):
-        store.trace(study, 0)
-    assert store.trace(study, 1) is not None
-    assert len(store.trials(study)) == 2
 
 
 def a_filled_file(path):
@@ -211,12 +138,6 @@ def test_no_folder(tmp_path, read_only):
         Store(tmp_path / ("x" * 300), read_only=read_only)
 
 
-def test_newer_schema_is_refused(store):
-    raw(store, "UPDATE chargetune_store SET schema_version = 99")
-    with pytest.raises(StoreError, match=r"schema version 99, this program knows versions up to 2"):
-        Store(store.location)
-
-
 def test_folder_without_write_permission(public):
     with unprivileged(), pytest.raises(StoreError, match="permission"):
         Store(public / "s.db")
@@ -231,17 +152,6 @@ def test_folder_without_write_permission(public):
         with Store(path, read_only=True) as store:
             assert len(store.trials(1)) == 2
     assert sorted(p.name for p in public.iterdir()) == ["t.db"]
-
-
-def test_read_only_reads_while_another_writes_and_changes_nothing(store):
-    study = a_study(store)
-    with Store(store.location, read_only=True) as reader:
-        finish(store, study, 0)
-        assert reader.trials(study)[0].status == "done"
-        for change in (lambda: finish(reader, study, 1), lambda: reader.add_study("b", {}), lambda: open_study(reader)):
-            with pytest.raises(StoreError, match="read-only"):
-                change()
-    assert [r.name for r in store.studies()] == ["a"]
 
 
 def test_long_lock_ends_in_a_message_that_names_the_holder(tmp_path):

@@ -49,3 +49,16 @@ def test_a_store_may_go_and_come_back(path, tmp_path):
         watch.studies()
     shutil.move(tmp_path / "away", path)
     assert len(watch.studies()) == 1
+
+
+def test_a_store_on_a_server_is_watched_as_well(postgres):
+    run_charging(postgres, charging())
+    watch = StoreWatch(postgres)
+    assert watch.study(1) is watch.study(1)
+    with Store(postgres) as opened:
+        for number in range(10, 13):
+            before = watch.study(1)
+            opened.add_trials(1, [Trial(number, before.trials[0].theta)])
+            assert len(watch.study(1).trials) == number + 1
+            opened.hand_out(1, opened.trials(1)[-1:], "w")
+            assert watch.study(1).trials[-1].attempt == 1

@@ -42,6 +42,7 @@ class TunerChoice(StrEnum):
 
 
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+StoreArgument = Annotated[str, typer.Argument(help="Store: a file, or postgresql://user@host/database.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program instead of text for a person.")]
 Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 
@@ -51,7 +52,9 @@ def tune(
     config: ConfigFile,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials in all; the file's number by default.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the study; the file's by default.")] = None,
-    store: Annotated[Path | None, typer.Option(help="Where trials are kept; by default OUT/study.sqlite or CONFIG's name.")] = None,
+    store: Annotated[
+        str | None, typer.Option(help="Where trials are kept, a file or postgresql://...; by default OUT/study.sqlite or CONFIG's name.")
+    ] = None,
     workers: Workers = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
@@ -93,7 +96,7 @@ def simulate(
 
 @app.command()
 def show(
-    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of a study; by default all are listed.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -105,7 +108,7 @@ def show(
 
 @app.command()
 def report(
-    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of a study; may be left out where there is one.")] = None,
     out: Annotated[Path | None, typer.Option("--output", "-o", help="Page to write; by default STORE's name with .html.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures as vector PDF, at the width of a journal.")] = None,
@@ -122,7 +125,7 @@ def report(
 
 @app.command()
 def web(
-    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    store: StoreArgument,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
     host: Annotated[str, typer.Option(help="Address to listen on; any but loopback needs a token.")] = "127.0.0.1",
     token: Annotated[str | None, typer.Option(envvar="CHARGETUNE_WEB_TOKEN", help="What a viewer must know.", show_default=False)] = None,
@@ -178,7 +181,7 @@ def identify(
 @app.command()
 def compare(
     config: ConfigFile,
-    store: Annotated[Path | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
+    store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise that the controllers see.")] = 0,
     workers: Workers = 2,
@@ -193,7 +196,7 @@ def compare(
 
 @app.command()
 def certify(
-    store: Annotated[Path, typer.Argument(help="Store file.", show_default=False)],
+    store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of the study; needed when the store holds several.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 0,
@@ -263,8 +266,8 @@ def main() -> None:
     except Exception as error:
         # Import only now: these modules are heavy, and are loaded already when one of them raised.
         from chargetune.study.identity import StudyError
-        from chargetune.study.runner import WorkerError
         from chargetune.study.records import StoreError
+        from chargetune.study.runner import WorkerError
 
         if not isinstance(error, (StudyError, StoreError, WorkerError)):
             raise

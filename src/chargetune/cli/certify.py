@@ -12,8 +12,9 @@ from rich.table import Table
 from chargetune.battery.certificate import Charge, run_charges, write_certificate
 from chargetune.battery.config import problem_of_document
 from chargetune.battery.spread import Spread
-from chargetune.cli.output import console, number
+from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
+from chargetune.study.database import store_name
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
 from chargetune.study.trial import best_feasible
@@ -22,7 +23,7 @@ __all__ = ["certify_command"]
 
 
 def certify_command(
-    path: Path,
+    location: str,
     *,
     study: str | None,
     episodes: int,
@@ -36,19 +37,19 @@ def certify_command(
     """Run the best feasible theta of a study on fresh episodes and write the certificate."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
-    with Store(path, read_only=True) as store:
+    with Store(location, read_only=True) as store:
         names = [record.name for record in store.studies()]
         if study is None and len(names) != 1:
-            raise ValueError(f"{path} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
+            raise ValueError(f"{store.label} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
         record = store.study(study or names[0])
         trials = store.trials(record.id)
     best = best_feasible(trials)
     if best is None:
-        raise ValueError(f"{path}: study {record.name!r} has no trial that kept every limit, so there is nothing to certify")
+        raise ValueError(f"{store.label}: study {record.name!r} has no trial that kept every limit, so there is nothing to certify")
     if "cell" not in record.identity["config"]:
-        raise ValueError(f"{path}: study {record.name!r} is not one of battery charging")
+        raise ValueError(f"{store.label}: study {record.name!r} is not one of battery charging")
     problem = problem_of_document(record.identity["config"])
-    target = output or path.with_name(f"{path.stem}-certificate.json")
+    target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def certify_command(
         charges,
         theta=dict(zip(problem.space.entries, best.theta, strict=True)),
         origin={
-            "store": path.name,
+            "store": store_name(location),
             "study": record.name,
             "study_sha256": record.identity_sha256,
             "trial": best.number,

@@ -12,7 +12,7 @@ from rich.table import Table
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.compare import Row, compare, row_names
 from chargetune.battery.config import load_config
-from chargetune.cli.output import console, number
+from chargetune.cli.output import console, number, shown
 from chargetune.cli.tune import bar
 from chargetune.report.style import check_format
 from chargetune.study.executors import process_executor
@@ -21,7 +21,7 @@ __all__ = ["compare_command"]
 
 
 def compare_command(
-    path: Path, *, store: Path | None, study: str | None, seed: int, workers: int, figure: Path | None, as_json: bool
+    path: Path, *, store: str | None, study: str | None, seed: int, workers: int, figure: Path | None, as_json: bool
 ) -> None:
     """Charge the plant of a study file in every way there is, and print one table."""
     if figure is not None:
@@ -60,12 +60,12 @@ def compare_command(
         screen.print(f"figure {figure}")
 
 
-def _tuned(store: Path, study: str, problem: ChargingProblem) -> list[float]:
+def _tuned(store: str, study: str, problem: ChargingProblem) -> list[float]:
     from chargetune.report.reading import read_study
 
     view = read_study(store, study)
     if view.tuned is None:
-        raise ValueError(f"{store}: study {study!r} has no trial with a score yet")
+        raise ValueError(f"{shown(store)}: study {study!r} has no trial with a score yet")
     return [float(value) for value in problem.space.validate(view.tuned.theta)]
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.episode.score import Score
+from chargetune.study.database import database_at
+from chargetune.study.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["console", "metrics_table", "theta_lines", "trials_table"]
+__all__ = ["beside", "console", "metrics_table", "shown", "theta_lines", "trials_table"]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -29,6 +33,20 @@ ROWS = (
 def console(*, stderr: bool = False) -> Console:
     """Where text for a person goes."""
     return Console(stderr=stderr, highlight=False)
+
+
+def beside(location: str, ending: str) -> Path:
+    """A file beside a store's file and with its name; for a store on a server, with the database's name here."""
+    database = database_at(location)
+    if isinstance(database, SqliteFile):
+        return Path(location).with_name(Path(location).stem + ending)
+    return Path(re.sub(r"[^\w.-]+", "-", database.label.partition("?")[0].rpartition("/")[2]) + ending)
+
+
+def shown(location: str) -> str:
+    """A store in a message: the path as it was given, or the URL without its password."""
+    database = database_at(location)
+    return location if isinstance(database, SqliteFile) else database.label
 
 
 def number(value: float | None, digits: int = 2) -> str:

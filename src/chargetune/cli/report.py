@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from chargetune.cli.output import console
+from chargetune.cli.output import beside, console, shown
 from chargetune.cli.tune import bar
 from chargetune.report import read_study, save_figures
 from chargetune.report.page import report_page
@@ -14,22 +14,22 @@ from chargetune.report.reading import read_studies
 __all__ = ["report_command"]
 
 
-def report_command(path: Path, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, as_json: bool) -> None:
+def report_command(location: str, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, as_json: bool) -> None:
     """Write the page, and with ``figures`` the figures of a paper."""
     if study is None:
-        names = [view.name for view in read_studies(path)]
+        names = [view.name for view in read_studies(location)]
         if len(names) != 1:
-            raise ValueError(f"{path} has {len(names)} studies, choose one by --study: {', '.join(names) or '(none)'}")
+            raise ValueError(f"{shown(location)} has {len(names)} studies, choose one by --study: {', '.join(names) or '(none)'}")
         study = names[0]
-    target = out or path.with_suffix(".html")
+    target = out or beside(location, ".html")
     if not target.parent.is_dir():
         raise ValueError(f"--output {target}: there is no folder {target.parent}")
-    view = read_study(path, study)
+    view = read_study(location, study)
     with bar(quiet=as_json) as progress:
         task = progress.add_task("sensitivities", total=view.space.dimension, note="")
         target.write_text(report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task)), encoding="utf-8")
         progress.remove_task(task)
-    drawn = save_figures(path, study, figures, ("pdf",)) if figures is not None else []
+    drawn = save_figures(location, study, figures, ("pdf",)) if figures is not None else []
     if as_json:
         print(json.dumps({"study": study, "page": str(target), "figures": [str(f) for f in drawn]}))  # noqa: T201
         return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -15,9 +14,9 @@ from chargetune.study.trial import Trial, TrialStatus, best_feasible
 __all__ = ["show_command"]
 
 
-def show_command(path: Path, *, study: str | None, as_json: bool) -> None:
+def show_command(location: str, *, study: str | None, as_json: bool) -> None:
     """Print the studies of a store, or every trial of one."""
-    with Store(path, read_only=True) as store:
+    with Store(location, read_only=True) as store:
         if study is not None:
             record = store.study(study)
             trials = store.trials(record.id)

@@ -20,7 +20,7 @@ from chargetune.battery.charging_check import check_charging
 from chargetune.battery.config import Config, load_config
 from chargetune.battery.reproduce import open_study, tuned_trial
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, metrics_table, number, theta_lines
+from chargetune.cli.output import console, metrics_table, number, shown, theta_lines
 from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
@@ -48,7 +48,7 @@ def tune_command(
     *,
     trials: int | None,
     seed: int | None,
-    store: Path | None,
+    store: str | None,
     workers: int,
     out: Path | None,
     as_json: bool,
@@ -61,7 +61,7 @@ def tune_command(
     count = config.study.trials if trials is None else trials
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    kept = store or (out / "study.sqlite" if out else Path(f"{path.stem}.sqlite"))
+    kept = store or str(out / "study.sqlite" if out else f"{path.stem}.sqlite")
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
@@ -86,12 +86,12 @@ def tune_command(
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
-    console().print(f"trials in {kept}" + "".join(f"\nfigure {f}" for f in figures))
+    console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
     _end(safety)
 
 
 def _run(
-    config: Config, folder: Path, problem: ChargingProblem, kept: Path, count: int, workers: int, *, quiet: bool
+    config: Config, folder: Path, problem: ChargingProblem, kept: str, count: int, workers: int, *, quiet: bool
 ) -> tuple[list[Trial], dict[str, Any] | None]:
     """The trials of the study, and what there is to say of safety."""
     with ExitStack() as stack:
@@ -103,7 +103,7 @@ def _run(
         progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
         if done and not quiet:
-            progress.console.print(f"resumed: {done} trials are in {kept}")
+            progress.console.print(f"resumed: {done} trials are in {shown(kept)}")
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from pathlib import Path
 
 from chargetune.cli.output import console
 from chargetune.study.store import Store
@@ -12,7 +11,7 @@ from chargetune.study.store import Store
 __all__ = ["web_command"]
 
 
-def web_command(path: Path, *, port: int, host: str, token: str | None) -> None:
+def web_command(location: str, *, port: int, host: str, token: str | None) -> None:
     """Serve a store until Ctrl-C."""
     try:
         import uvicorn
@@ -25,13 +24,13 @@ def web_command(path: Path, *, port: int, host: str, token: str | None) -> None:
         raise ValueError(f"--host {host} can be reached from other machines: give a --token of at least {LEAST_TOKEN} characters")
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
         raise ValueError(f"--token has {len(token)} characters, allowed are at least {LEAST_TOKEN} printable ASCII ones")
-    with Store(path, read_only=True):
-        pass  # what cannot be shown is refused now
+    with Store(location, read_only=True) as store:
+        label = store.label  # what cannot be shown is refused now
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family) as listening:
         bound = listening.getsockname()[1]
         config = uvicorn.Config(
-            make_app(path, token=token, hosts=frozenset({host.lower()}), ending=lambda: server.should_exit),
+            make_app(location, token=token, hosts=frozenset({host.lower()}), ending=lambda: server.should_exit),
             log_level="warning",
             access_log=False,
             server_header=False,
@@ -40,7 +39,7 @@ def web_command(path: Path, *, port: int, host: str, token: str | None) -> None:
         server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
-        console().print(f"{path}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
+        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
         # uvicorn passes Ctrl-C on once it has ended in good order.
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])

@@ -36,7 +36,7 @@ def figures_of(view: StudyView) -> dict[str, Figure]:
 
 
 def save_figures(
-    store_path: str | os.PathLike[str],
+    store: str | os.PathLike[str],
     name: str,
     folder: str | os.PathLike[str],
     formats: Sequence[str] = ("png",),
@@ -51,7 +51,7 @@ def save_figures(
     unknown = [f for f in formats if f not in FORMATS]
     if unknown or not formats or isinstance(formats, str):
         raise ValueError(f"formats = {formats!r}, allowed is a non-empty selection of {', '.join(FORMATS)}")
-    view = read_study(store_path, name, trials=trials)
+    view = read_study(store, name, trials=trials)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     return [save(figure, target / f"{stem}.{kind}") for stem, figure in figures_of(view).items() for kind in formats]

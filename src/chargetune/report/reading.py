@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -32,13 +31,15 @@ class Reading:
 
 @dataclass(frozen=True)
 class StudyView:
-    """A study as it stood when it was read. ``problem`` is None when the study is not one of battery charging.
+    """A study as it stood when it was read from the store at ``location``.
+
+    ``problem`` is None when the study is not one of battery charging.
 
     ``tuner`` is the tuner's name in the configuration, empty when that names none. ``record`` is what the store says of the
     study as a whole, None only for trials that come from no store.
     """
 
-    path: Path
+    location: str
     name: str
     tuner: str
     space: ParameterSpace
@@ -78,7 +79,7 @@ class StudyView:
 
         Raises StoreError for a trace that is not as it was stored, naming the trial.
         """
-        with Store(self.path, read_only=True) as store:
+        with Store(self.location, read_only=True) as store:
             record = store.study(self.name)
             for trial in trials:
                 trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
@@ -87,7 +88,7 @@ class StudyView:
 
     def readings(self, trials: Iterable[Trial]) -> Iterator[Reading]:
         """Each of ``trials`` with its episode or the reason why there is none; nothing is raised for a single trace."""
-        with Store(self.path, read_only=True) as store:
+        with Store(self.location, read_only=True) as store:
             record = store.study(self.name)
             for trial in trials:
                 try:
@@ -107,35 +108,33 @@ class StudyView:
         return None if trial is None else next((episode for _, episode in self.episodes([trial])), None)
 
 
-def read_study(store_path: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
+def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
     """Read a study, or its first ``trials`` trials, without writing to the store.
 
-    Raises StoreError for a file that is no store and for an unknown study, naming those that there are; ValueError for a study
+    Raises StoreError for what is no store and for an unknown study, naming those that there are; ValueError for a study
     without trials.
     """
-    path = Path(store_path)
-    with Store(path, read_only=True) as store:
-        record = store.study(name)
-        found = store.trials(record.id)[:trials]
+    with Store(store, read_only=True) as opened:
+        record = opened.study(name)
+        found = opened.trials(record.id)[:trials]
     if not found:
-        raise ValueError(f"{path}: study {name!r} has no trials yet, so there is nothing to draw")
-    return _view(path, record, found)
+        raise ValueError(f"{opened.label}: study {name!r} has no trials yet, so there is nothing to draw")
+    return _view(opened.location, record, found)
 
 
-def read_studies(store_path: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
+def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
     """Every study of a store, oldest first, also those without trials; ``only`` reads the one with this id, if there is one.
 
-    Raises StoreError for a file that is no store.
+    Raises StoreError for what is no store.
     """
-    path = Path(store_path)
-    with Store(path, read_only=True) as store:
-        return [_view(path, r, store.trials(r.id)) for r in store.studies() if only is None or r.id == only]
+    with Store(store, read_only=True) as opened:
+        return [_view(opened.location, r, opened.trials(r.id)) for r in opened.studies() if only is None or r.id == only]
 
 
-def _view(path: Path, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
+def _view(location: str, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
     config = record.identity["config"]
     return StudyView(
-        path=path,
+        location=location,
         name=record.name,
         tuner=str(config.get("study", {}).get("tuner", "")),
         space=space_from_json(record.identity["space"]),

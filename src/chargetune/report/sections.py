@@ -12,6 +12,7 @@ from chargetune.report.reading import StudyView
 from chargetune.report.recheck import Check, recheck
 from chargetune.report.rows import study_head
 from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
+from chargetune.study.database import store_name
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["failures", "limits", "opening", "provenance", "result", "sensitivities", "violations", "what_was_tuned"]
@@ -195,7 +196,7 @@ def sensitivities(view: StudyView, moved: Sequence[Sensitivity]) -> str:
 
 def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
     record = view.record
-    rows: list[tuple[Cell, ...]] = [("store", view.path.name)]
+    rows: list[tuple[Cell, ...]] = [("store", store_name(view.location))]
     if record is not None:
         rows += [("study begun", record.created_at), ("configuration (SHA-256)", record.identity_sha256)]
         rows += [("seed of the study", str(record.identity.get("seed"))), ("trials proposed at a time", str(record.identity.get("batch")))]

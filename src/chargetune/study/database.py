@@ -13,7 +13,7 @@ from sqlalchemy.exc import DBAPIError
 from chargetune.study.records import StoreError
 from chargetune.study.sqlite import SqliteFile
 
-__all__ = ["Database", "Hold", "database_at"]
+__all__ = ["Database", "Hold", "database_at", "store_name"]
 
 
 class Hold(Protocol):
@@ -57,6 +57,10 @@ class Database(Protocol):
         """Whether the connection broke, so that the transaction may or may not have been stored."""
         ...
 
+    def mark(self) -> tuple[object, bool]:
+        """Something that differs after every change, and whether it is to be trusted: an equal one then means no change."""
+        ...
+
     def hold(self, study_id: int) -> Hold | None:
         """Take a study for this process; None when another process has it."""
         ...
@@ -68,9 +72,15 @@ def database_at(location: str | os.PathLike[str]) -> Database:
     scheme = re.match(r"([A-Za-z][A-Za-z0-9+.-]*)://", text)
     if scheme is None:
         return SqliteFile(Path(text).resolve())
-    if scheme[1] not in ("postgresql", "postgres"):
+    if scheme[1] not in ("postgresql", "postgresql+psycopg", "postgres"):
         raise StoreError(f"store {scheme[0]}...: allowed are the path of a file and postgresql://user@host/database")
     # Only here: the driver is an extra.
     from chargetune.study.postgres import server_at
 
     return server_at(text)
+
+
+def store_name(location: str | os.PathLike[str]) -> str:
+    """What a page calls the store: the file's name, or the URL without its password."""
+    database = database_at(location)
+    return database.path.name if isinstance(database, SqliteFile) else database.label

@@ -7,7 +7,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, insert, inspect, make_url, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, func, insert, inspect, make_url, select, text
 from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.pool import NullPool, QueuePool
 
@@ -30,9 +30,6 @@ MEANINGS = {
     "53100": "the server's disk is full, nothing of this transaction was stored",
     "XX001": "the server reports damaged data, nothing was changed",
     "XX002": "the server reports a damaged index, nothing was changed",
-    "3D000": "there is no such database",
-    "28P01": "the password is wrong",
-    "28000": "the server does not let this user in",
 }
 
 
@@ -45,7 +42,7 @@ class PostgresServer:
     @property
     def location(self) -> str:
         """What opens the same store again, a password included."""
-        return self.url.render_as_string(hide_password=False)
+        return self.url.set(drivername="postgresql").render_as_string(hide_password=False)
 
     @property
     def label(self) -> str:
@@ -103,7 +100,7 @@ class PostgresServer:
         state = getattr(error.orig, "sqlstate", None)
         if state in MEANINGS:
             return f"{self.label}: {MEANINGS[state]} ({reason})"
-        return f"{self.label}: {'the server cannot be reached' if self.lost(error) else 'refused'} ({reason})"
+        return f"{self.label}: {'no connection to the server' if self.lost(error) else 'refused'} ({reason})"
 
     def lost(self, error: DBAPIError) -> bool:
         """Whether the connection broke or could not be made: no SQLSTATE, or one of class 08 or 57P (server going down)."""
@@ -112,6 +109,19 @@ class PostgresServer:
             type(error.orig).__name__ in ("OperationalError", "AdminShutdown", "CrashShutdown", "CannotConnectNow")
             and (state is None or state.startswith(("08", "57P")))
         )
+
+    def mark(self) -> tuple[object, bool]:
+        """Counts of what can be added and the hashes of what can be replaced."""
+        engine = self.connect(read_only=True, busy_timeout_s=0.0)
+        try:
+            with engine.connect() as connection:
+                trials = select(func.count(), func.count(schema.trial.c.told_at), func.sum(schema.trial.c.attempt))
+                studies = select(schema.study.c.identity_sha256).order_by(schema.study.c.id)
+                return (tuple(connection.execute(trials).one()), tuple(connection.execute(studies).scalars())), True
+        except DBAPIError as error:
+            raise StoreError(self.explain(error)) from error
+        finally:
+            engine.dispose()
 
     def hold(self, study_id: int) -> ServerHold | None:
         """Take the study's advisory lock on a connection of its own; the server gives it back when that connection ends."""
@@ -170,7 +180,7 @@ def server_at(location: str) -> PostgresServer:
     return PostgresServer(url)
 
 
-def _engine(url: URL, pool: type[NullPool] | type[QueuePool], options: dict[str, Any]) -> Engine:
+def _engine(url: URL, pool: type[NullPool | QueuePool], options: dict[str, Any]) -> Engine:
     # Keepalives: a connection that a router forgot is noticed within a minute instead of hours.
     alive = {"keepalives": 1, "keepalives_idle": 20, "keepalives_interval": 10, "keepalives_count": 3}
     arguments = {"connect_timeout": CONNECT_S, "application_name": "chargetune", **alive}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from chargetune.study.provenance import made_by, utc_now
 from chargetune.study.records import StoreError
 
 __all__ = ["SqliteFile"]
+
+# A file system may give two writes within some milliseconds the same time: a change younger than this may hide another.
+SETTLED_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,21 @@ class SqliteFile:
     def lost(self, error: DBAPIError) -> bool:
         """Never: there is no connection to lose."""
         return False
+
+    def mark(self) -> tuple[object, bool]:
+        """Identity, size and time of the file and of its log, and whether the newest of them has some age."""
+        marks: list[tuple[int, int, int]] = []
+        newest = 0.0
+        for path in (self.path, self.path.with_name(self.path.name + "-wal")):
+            try:
+                found = path.stat()
+            except OSError:
+                continue
+            # An empty log says nothing, and comes and goes with those who only read.
+            if found.st_size:
+                marks.append((found.st_ino, found.st_size, found.st_mtime_ns))
+                newest = max(newest, found.st_mtime)
+        return tuple(marks), time.time() - newest > SETTLED_S
 
     def hold(self, study_id: int) -> Lease | None:
         """Lock the study's byte of the lock file beside the store."""

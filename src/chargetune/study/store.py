@@ -154,6 +154,8 @@ class Store:
 
     def add_trials(self, study_id: int, trials: Sequence[Trial], *, term: int | None = None) -> None:
         """Record trials as running, all or none. Their numbers must go on where the stored ones end."""
+        if not trials:
+            return
         rows = [{"study_id": study_id, **trial_row(trial)} for trial in trials]
         own = (schema.trial.c.study_id == study_id, schema.trial.c.number >= 0)
 

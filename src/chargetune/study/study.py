@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameters import ParameterSpace
+from chargetune.study.database import Hold
 from chargetune.study.document import score_to_json
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.identity import StudyError, check_change, study_identity
-from chargetune.study.database import Hold
 from chargetune.study.provenance import utc_now, versions
 from chargetune.study.runner import WorkerError, check_crosses, outcomes
 from chargetune.study.store import Store, StudyRecord

@@ -9,7 +9,6 @@ import os
 import re
 from functools import cache
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
@@ -35,19 +34,19 @@ TYPES = {"css": "text/css", "js": "text/javascript", "html": "text/html"}
 
 
 def make_app(
-    store_path: str | os.PathLike[str],
+    store: str | os.PathLike[str],
     *,
     token: str | None = None,
     hosts: frozenset[str] = frozenset(),
     ending: Ending = lambda: False,
 ) -> ASGIApp:
-    """The application for one store. ``hosts`` are further names of this machine that a request without token may ask for.
+    """The application for one store, a file or a URL. ``hosts`` are further names of this machine that a request without token may ask for.
 
     ``ending`` is asked twice a second whether the server is about to end; then the streams do too.
 
     A study and a trial are addressed by number, a file by its name in a table made here: no path from outside is ever opened.
     """
-    watch = StoreWatch(Path(store_path))
+    watch = StoreWatch(store)
     files = _files()
     pages = {name: _own(name) for name in ("index.html", "study.html")}
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import threading
-import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from chargetune.report.reading import StudyView, read_studies
+from chargetune.study.database import database_at
 
 __all__ = ["StoreWatch"]
-
-# A file system may give two writes within some milliseconds the same time: what is younger than this is read again.
-SETTLED_S = 1.0
-
-Fingerprint = tuple[tuple[int, int, int], ...]
 
 
 @dataclass
@@ -24,8 +19,8 @@ class StoreWatch:
     Opened read-only for each reading, so a store may be moved away and come back. Raises StoreError as `read_studies` does.
     """
 
-    path: Path
-    _known: dict[int | None, tuple[Fingerprint, list[StudyView]]] = field(default_factory=dict)
+    location: str | os.PathLike[str]
+    _known: dict[int | None, tuple[object, list[StudyView]]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def studies(self) -> list[StudyView]:
@@ -38,28 +33,13 @@ class StoreWatch:
 
     def _read(self, only: int | None) -> list[StudyView]:
         with self._lock:
-            mark, settled = self._fingerprint()
+            mark, settled = database_at(self.location).mark()
             known = self._known.get(only)
             if known is not None and known[0] == mark:
                 return known[1]
-            found = read_studies(self.path, only)
+            found = read_studies(self.location, only)
             if settled:
                 self._known[only] = (mark, found)
             else:
                 self._known.pop(only, None)
             return found
-
-    def _fingerprint(self) -> tuple[Fingerprint, bool]:
-        """Identity, size and time of the database and of its log, and whether the newest of them has some age."""
-        marks: list[tuple[int, int, int]] = []
-        newest = 0.0
-        for path in (self.path, self.path.with_name(self.path.name + "-wal")):
-            try:
-                found = path.stat()
-            except OSError:
-                continue
-            # An empty log says nothing, and comes and goes with those who only read.
-            if found.st_size:
-                marks.append((found.st_ino, found.st_size, found.st_mtime_ns))
-                newest = max(newest, found.st_mtime)
-        return tuple(marks), time.time() - newest > SETTLED_S
