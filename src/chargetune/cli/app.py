@@ -52,7 +52,7 @@ def tune(
     trials: Annotated[int | None, typer.Option(min=1, help="Trials in all; the file's number by default.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the study; the file's by default.")] = None,
     store: Annotated[Path | None, typer.Option(help="Where trials are kept; by default OUT/study.sqlite or CONFIG's name.")] = None,
-    workers: Workers = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes: for the batches of the file, else a trial each.")] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     as_json: AsJson = False,

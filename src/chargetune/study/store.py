@@ -162,7 +162,7 @@ class Store:
                 ending=ending,
                 told_at=utc_now(),
                 trace_sha256=None if trace is None else sha256(trace),
-                provenance=provenance,
+                provenance={**stored.provenance, **provenance},
             )
             if stored.status is not TrialStatus.RUNNING:
                 if _result(stored) == _result(told):
@@ -172,6 +172,16 @@ class Store:
                 connection.execute(insert(schema.trace).values(study_id=study_id, number=number, data=trace))
             connection.execute(update(schema.trial).where(*where).values(_values(told)))
         return told
+
+    def count_loss(self, study_id: int, number: int, by: int = 1) -> int:
+        """Add to how many workers a running trial has lost, and give that number."""
+        where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
+        with self._writing() as connection:
+            provenance = json.loads(connection.execute(select(schema.trial.c.provenance).where(*where)).scalar_one())
+            provenance["losses"] = provenance.get("losses", 0) + by
+            text = canonical_json(provenance, "provenance")
+            connection.execute(update(schema.trial).where(*where).values(provenance=text))
+        return int(provenance["losses"])
 
     def note_holder(self, study_id: int, process: int, host: str) -> None:
         """Record who works on a study, for the message to whoever is refused."""

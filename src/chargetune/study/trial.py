@@ -39,7 +39,8 @@ class Trial:
     trace_sha256
         SHA-256 of the stored trace, None when there is none.
     provenance
-        Hash of the study's configuration, versions of the programs, machine.
+        Hash of the study's configuration, versions of the programs, machine; ``pending``: numbers of the trials that were
+        running when it was proposed beside them; ``losses``: how many workers were lost by it.
     episode
         Reads the trial's stored episode; a study gives it to its tuner, nobody else has it.
     """
@@ -61,6 +62,11 @@ class Trial:
             raise ValueError(f"trial: number = {self.number}, allowed is an integer >= 0")
         if (self.score is not None) != (self.status is TrialStatus.DONE):
             raise ValueError(f"trial {self.number}: status = {self.status}, a score belongs to the status 'done' and only to it")
+
+    @property
+    def losses(self) -> int:
+        """How many workers were lost while they evaluated it."""
+        return int(self.provenance.get("losses", 0))
 
     @property
     def feasible(self) -> bool:
