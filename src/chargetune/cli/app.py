@@ -64,6 +64,20 @@ def tune(
 
 
 @app.command()
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign file (TOML): study files and seeds.", show_default=False)],
+    store: Annotated[Path | None, typer.Option(help="Where all trials are kept; by default CAMPAIGN's name.")] = None,
+    workers: Workers = 2,
+    force: Annotated[bool, typer.Option("--force", help="Tune although the check of a formulation finds an error.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Tune many study files with many seeds. The same command again resumes."""
+    from chargetune.cli.campaign import campaign_command
+
+    campaign_command(file, store=store, workers=workers, force=force, as_json=as_json)
+
+
+@app.command()
 def check(
     config: ConfigFile,
     safe: Annotated[str | None, typer.Option(help="A theta declared safe, as for simulate --theta; it has to keep every limit.")] = None,

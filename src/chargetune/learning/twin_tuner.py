@@ -49,7 +49,8 @@ class TwinTuner:
     Each theta solves max objective s.t. excess <= tolerance, in every window where the score has a profile, on the
     simulated closed loop with the twin at its posterior mode plus the mean discrepancy (`Search`), from the ``starts`` best of
     ``pool`` Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. Further thetas of a batch, and
-    those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
+    those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same thetas.
+    Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
