@@ -76,8 +76,8 @@ def _table(rows: Any, height: int | None = None) -> Table:
         order = {"running": 0, "stopped": 1, "waiting": 2, "done": 3}
         rows = sorted(rows, key=lambda row: order[row.state])[:fit]
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    for heading in ("study", "", "trials", "failed", "violating", "best trial", "t80 min", "t95 min"):
-        table.add_column(heading, justify="left" if heading in ("study", "") else "right")
+    for heading in ("study", "", "trials", "failed", "violating", "best", "t80 min", "t95 min"):
+        table.add_column(heading, justify="left" if heading in ("study", "") else "right", no_wrap=True)
     for row in rows:
         score = row.best.score if row.best is not None and row.best.feasible else None
         table.add_row(
