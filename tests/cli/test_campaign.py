@@ -54,7 +54,7 @@ def test_table_resume_and_json(tmp_path):
 
     (tmp_path / "one.toml").write_text(STUDY.replace("60", "50"))
     stopped = chargetune("campaign", path, "--store", store, code=1).stdout
-    assert "one seed 0 stopped: StudyError: study 'one seed 0' was begun with something else" in stopped.replace("\n", " ")
+    assert "one seed 0 stopped: StudyError: study 'one seed 0' was begun with something else" in " ".join(stopped.split())
 
 
 def test_what_is_wrong_is_said_before_anything_is_stored(tmp_path):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 
 from chargetune.study.trial import Trial, TrialStatus, best_feasible
 
-__all__ = ["Progress", "Tally"]
+__all__ = ["Progress", "Tally", "progress_bar"]
 
 # The trial told last, the best feasible trial, the number of done trials that broke a limit, the number of failed trials.
 Progress = Callable[[Trial, Trial | None, int, int], None]
@@ -29,3 +30,21 @@ class Tally:
         self._failures += told.status is TrialStatus.FAILED
         if self._progress is not None:
             self._progress(told, self.incumbent, self._violating, self._failures)
+
+
+@contextmanager
+def progress_bar(known: Iterable[Trial], trials: int) -> Iterator[Progress]:
+    """A bar of tqdm, a widget in a notebook. Raises ImportError without tqdm."""
+    try:
+        from tqdm.auto import tqdm
+    except ImportError as error:
+        raise ImportError("progress=True needs tqdm: pip install chargetune[notebook]") from error
+    told = sum(t.status is not TrialStatus.RUNNING for t in known)
+    with tqdm(total=max(trials, told), initial=told, unit="trial") as bar:
+
+        def show(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
+            best = "none" if incumbent is None or incumbent.score is None else f"{incumbent.score.objective:.4g}"
+            bar.set_postfix_str(f"best {best}, {violating} violating, {failures} failed", refresh=False)
+            bar.update()
+
+        yield show

@@ -23,7 +23,8 @@ from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.lease import Lease, take_lease
-from chargetune.study.progress import Progress, Tally
+from chargetune.study.notebook import study_html, trials_dataframe
+from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
@@ -123,6 +124,14 @@ class Study:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
         return best_performance(self.trials())
 
+    def trials_dataframe(self) -> Any:
+        """All trials as a pandas data frame, see `trials_dataframe`. Raises ImportError without pandas."""
+        return trials_dataframe(self.space, self.trials())
+
+    def _repr_html_(self) -> str:
+        about = {"tuner": type(self.tuner).__name__, "store": str(self.store.path)}
+        return study_html(self.record.name, about, self.space, self.trials())
+
     def trace(self, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
         """Arrays and metadata of a trial's episode, None when none was stored."""
         return self.store.trace(self.record.id, number)
@@ -181,7 +190,7 @@ class Study:
         executor: Executor | None = None,
         workers: int | None = None,
         attempts: int = 3,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> Trial | None:
         """Evaluate until the study has ``trials`` told trials, and return the best feasible one.
 
@@ -198,6 +207,7 @@ class Study:
             the study until somebody tells it or lets it fail.
         progress
             Receives the trial told last, the best feasible trial, the number of done trials that broke a limit, and of failed ones.
+            True shows a bar, in a notebook as a widget (`tqdm.auto`, extra ``notebook``).
 
         Trials that a dead process left running are evaluated first, again, with the same theta and seed. What ``evaluate`` raises
         makes that trial failed and the study goes on. On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt
@@ -213,6 +223,8 @@ class Study:
                 executor = stack.enter_context(process_executor(workers))
             check_crosses(evaluate, executor)
             known = self.trials()
+            if isinstance(progress, bool):
+                progress = stack.enter_context(progress_bar(known, trials)) if progress else None
             tally = Tally(known, progress)
             left = [t for t in known if t.status is TrialStatus.RUNNING]
             if left and attempts == 1:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from chargetune.episode.notebook import facts
 from chargetune.episode.score import Score
 
 __all__ = ["Trial", "TrialStatus", "best_feasible", "best_performance"]
@@ -72,6 +73,11 @@ class Trial:
     def feasible(self) -> bool:
         """Whether the trial is done and kept every limit."""
         return self.score is not None and self.score.feasible
+
+    def _repr_html_(self) -> str:
+        theta = ", ".join(f"{value:.5g}" for value in self.theta)
+        head = facts(f"Trial {self.number}", {"status": self.status.value, "ending": self.ending, "theta": theta, "seed": str(self.seed)})
+        return head + (self.score._repr_html_() if self.score is not None else "")
 
 
 def best_feasible(trials: Iterable[Trial]) -> Trial | None:
