@@ -55,12 +55,23 @@ def tune(
     workers: Annotated[int, typer.Option(min=1, help="Worker processes: for the batches of the file, else a trial each.")] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
+    accept_changed: Annotated[bool, typer.Option("--accept-changed", help="Resume although the study file has changed.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
     from chargetune.cli.tune import tune_command
 
-    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, force=force, as_json=as_json)
+    tune_command(
+        config,
+        trials=trials,
+        seed=seed,
+        store=store,
+        workers=workers,
+        out=out,
+        force=force,
+        accept_changed=accept_changed,
+        as_json=as_json,
+    )
 
 
 @app.command()
