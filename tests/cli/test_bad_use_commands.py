@@ -1,10 +1,11 @@
 """Bad use of the commands: refused with exit code 2 and one message, before a store is made."""
 
 import json
-import subprocess
 import sys
 
 import pytest
+
+from chargetune.cli import main
 
 STUDY = """
 [study]
@@ -22,9 +23,22 @@ upper_V = 0.2
 """
 
 
-def chargetune(*arguments):
-    done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout, " ".join(done.stderr.split())
+@pytest.fixture
+def chargetune(monkeypatch, capsys):
+    """The command in this process, which is quicker than a new one: exit code, stdout, stderr on one line."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code or 0
+        else:
+            code = 0
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return run
 
 
 def write(folder, name="a study", steps=60):
@@ -34,17 +48,16 @@ def write(folder, name="a study", steps=60):
 
 
 @pytest.mark.parametrize("option", ["--workers=0", "--workers=-1", "--workers=two", "--trials=0", "--trials=-5", "--trials=1.5"])
-def test_bad_numbers(tmp_path, option):
+def test_bad_numbers(chargetune, tmp_path, option):
     code, _, said = chargetune("tune", write(tmp_path), "--store", tmp_path / "s.sqlite", option)
-    name, value = option.split("=")
     assert code == 2
-    assert name in said
-    assert value in said
+    assert f"Invalid value for '{option.partition('=')[0]}': Input should be " in said
+    assert "greater than or equal to 1" in said or "a valid integer" in said
     assert not (tmp_path / "s.sqlite").exists()
 
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "<script>alert(1)</script>", "a/b", "..", "C:\\\\x"])
-def test_bad_names(tmp_path, name):
+def test_bad_names(chargetune, tmp_path, name):
     code, _, said = chargetune("tune", write(tmp_path, name), "--store", tmp_path / "s.sqlite")
     assert code == 2
     assert "study name = " in said
@@ -52,7 +65,7 @@ def test_bad_names(tmp_path, name):
     assert sorted(p.name for p in tmp_path.iterdir() if "sqlite" not in p.name) == ["study.toml"]
 
 
-def test_a_changed_file_is_refused_unless_asked(tmp_path):
+def test_a_changed_file_is_refused_unless_asked(chargetune, tmp_path):
     store = tmp_path / "s.sqlite"
     assert chargetune("tune", write(tmp_path), "--store", store)[0] == 0
     path = write(tmp_path, steps=70)
