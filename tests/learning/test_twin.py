@@ -10,7 +10,7 @@ from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.twin import ChargingTwin
-from chargetune.learning import Twin, TwinTuner, Uncertain
+from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -139,3 +139,27 @@ def test_without_a_trace_the_design_is_theta_0_and_sobol():
     np.testing.assert_array_equal(first[0], problem.space.default)
     lost = [SimpleNamespace(number=0, theta=tuple(first[0]), status="failed", score=None, episode=None)]
     np.testing.assert_array_equal(tuner.ask(problem.space, lost)[0], first[1])
+
+
+def test_beside_a_running_trial_another_theta_is_proposed():
+    problem = charge(ratios=(ResistanceRatio("R0"),))
+    tuner = TwinTuner(ChargingTwin(problem), pool=8, steps=2, iterations=3)
+    score, episode, _ = problem(problem.space.default, 0)
+    trials = [SimpleNamespace(number=0, theta=tuple(problem.space.default), status="done", score=score, episode=lambda: episode)]
+    expected = tuner.ask(problem.space, trials)[0]
+    for number in (1, 2):
+        trials.append(SimpleNamespace(number=number, theta=tuple(expected), status="running", score=None, episode=None))
+        beside = tuner.ask(problem.space, trials)
+        assert np.all(problem.space.validate(beside[0]) == beside[0])
+        apart = problem.space.to_unit(np.array([t.theta for t in trials])) - problem.space.to_unit(beside)
+        assert np.abs(apart).max(axis=1).min() > 1e-4
+        np.testing.assert_array_equal(tuner.ask(problem.space, trials), beside)
+        expected = beside[0]
+
+
+def test_a_safe_twin_takes_nothing_from_a_running_trial():
+    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    first = tuner.ask(problem.space, [])
+    running = [SimpleNamespace(number=0, theta=tuple(first[0]), status="running", score=None, episode=None)]
+    np.testing.assert_array_equal(tuner.ask(problem.space, running), first)

@@ -57,7 +57,7 @@ def test_summary(stores):
 def test_other_systems_have_no_limits_in_their_document(tmp_path):
     (view,) = read_studies(other_study(tmp_path / "o.sqlite", "crane"))
     assert study_head(view)["limits"] == []
-    assert read_studies(view.path, only=99) == []
+    assert read_studies(view.location, only=99) == []
 
 
 def test_theta_document_goes_back_into_the_space(view):

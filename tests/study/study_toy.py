@@ -1,15 +1,19 @@
 """A deterministic study in two parameters: a tuner that learns, an evaluation that violates, fails and leaves a trace."""
 
+import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from chargetune.episode.score import Score
 from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.study.evaluation import trial_seed
 from chargetune.study.study import Study
 
 SPACE = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5), Parameter("r", 0.1, 6.0, 1.0, scale="log")))
+SEED = 11
 CONFIG = {"plant": {"noise": 1e-3, "steps": 20}, "name": "toy"}
 
 
@@ -60,15 +64,37 @@ class Toy:
         return score, ToyEpisode(4.0 + noise), "done"
 
 
-def crash(theta, seed):
-    """End the worker process without a word."""
-    import os
+@dataclass(frozen=True)
+class Deadly:
+    """The toy, but one trial of the toy's study ends the process without a word; with ``once`` only the first time."""
 
-    os._exit(7)
+    number: int
+    once: Path | None = None
+
+    def __call__(self, theta, seed):
+        if seed == trial_seed(SEED, self.number) and not (self.once and self.once.exists()):
+            if self.once:
+                self.once.touch()
+            os._exit(7)
+        return Toy()(theta, seed)
+
+
+class OnlyHere:
+    """Pickles, and cannot be unpickled."""
+
+    def __reduce__(self):
+        return not_here, ()
+
+    def __call__(self, theta, seed):
+        return Toy()(theta, seed)
+
+
+def not_here():
+    raise RuntimeError("not here")
 
 
 def open_study(store, name="toy", **changes):
-    arguments = {"config": CONFIG, "space": SPACE, "tuner": Halfway(3), "seed": 11} | changes
+    arguments = {"config": CONFIG, "space": SPACE, "tuner": Halfway(3), "seed": SEED} | changes
     return Study.create_or_resume(store, name, **arguments)
 
 

@@ -275,7 +275,7 @@ class TestAttempts:
             open_study(opened, batch=3)
         with open_study(opened, batch=3, hardware=True) as study:
             assert [t.attempt for t in study.trials()] == [1, 0, 0]
-            with pytest.raises(StoreError, match="on hardware that happens once"):
+            with pytest.raises(StudyError, match=r"trials \[0\] were begun .* on hardware nothing is repeated"):
                 study.run(plug_pulled, 3)
             assert len(runs) == 1
             study.fail(0, "the operator: not run to its end")

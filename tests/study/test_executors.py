@@ -1,13 +1,15 @@
 import os
 import signal
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import pytest
-from study_toy import Toy, crash, essence, open_study
+from study_toy import Deadly, OnlyHere, Toy, essence, open_study
 
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
-from chargetune.study.study import WorkerError
+from chargetune.study.study import StudyError, WorkerError
 
 
 def environment(_):
@@ -24,13 +26,85 @@ def test_processes_give_the_trials_of_this_process(store, tmp_path):
         assert essence(study.trials()) == found
 
 
-def test_a_lost_worker_is_told_and_its_trials_can_be_run_again(store, tmp_path):
-    with open_study(store, batch=2) as study:
-        with process_executor(1) as pool, pytest.raises(WorkerError, match="the same call resumes"):
-            study.run(crash, 4, executor=pool)
-        assert [t.status for t in study.trials()] == ["running"] * 2
+def test_a_plant_that_ends_its_process_costs_its_own_trial_only(store, tmp_path):
+    with open_study(store, batch=4) as study, process_executor(2) as pool:
+        study.run(Deadly(5), 12, executor=pool)
+        trials = study.trials()
+    with Store(tmp_path / "whole.db") as other, open_study(other, batch=4) as study:
+        study.run(Toy(), 8)
+        expected = essence(study.trials())
+    assert essence(trials)[:5] + essence(trials)[6:8] == expected[:5] + expected[6:]
+    assert [t.number for t in trials if t.losses] == [5]
+    assert trials[5].losses == 3
+    assert trials[5].ending.startswith("lost: each of 3 attempts ended with the process that evaluated it (BrokenProcessPool: ")
+    assert trials[5].score is None
+
+
+def test_a_worker_lost_once_costs_nothing(store, tmp_path):
+    with open_study(store, batch=3) as study, process_executor(2) as pool:
+        study.run(Deadly(4, tmp_path / "once"), 9, executor=pool)
+        found = essence(study.trials())
+        assert [t.losses for t in study.trials()] == [0, 0, 0, 0, 1, 0, 0, 0, 0]
+    with Store(tmp_path / "whole.db") as other, open_study(other, batch=3) as study:
+        study.run(Toy(), 9)
+        assert essence(study.trials()) == found
+
+
+def test_a_pool_that_breaks_as_a_whole_is_given_up_and_resumes_lose_one_trial(store, tmp_path):
+    """Of Python's own pool nobody can say which call broke it: a resume evaluates the suspects one by one."""
+    with open_study(store, batch=4) as study:
+        for _ in range(3):
+            with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, pytest.raises(WorkerError, match="same call resumes"):
+                study.run(Deadly(2), 8, executor=pool)
+        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+            study.run(Deadly(2), 8, executor=pool)
+        trials = study.trials()
+    assert [t.number for t in trials if (t.ending or "").startswith("lost:")] == [2]
+    assert all(t.losses <= 1 for t in trials if t.number != 2)
+    with Store(tmp_path / "whole.db") as other, open_study(other, batch=4) as study:
         study.run(Toy(), 4)
-        assert not study.running()
+        assert [e for e in essence(study.trials()) if e[0] != 2] == [e for e in essence(trials)[:4] if e[0] != 2]
+
+
+def run_deadly(path):
+    with Store(path) as store, open_study(store) as study:
+        study.run(Deadly(2), 6)
+
+
+def test_a_plant_that_ends_the_process_of_the_study_costs_one_trial(store):
+    endings = []
+    for _ in range(4):
+        process = get_context("fork").Process(target=run_deadly, args=(store.location,))
+        process.start()
+        process.join()
+        endings.append(process.exitcode)
+    trials = store.trials(1)
+    assert endings == [7, 7, 7, 0]
+    assert trials[2].ending == "lost: each of 3 attempts ended with the process that evaluated it"
+    assert [t.number for t in trials if t.losses or t.ending.startswith("lost")] == [2]
+    assert len(trials) == 6
+
+
+def test_what_may_not_be_repeated_stops_the_study_until_somebody_tells_it(store):
+    with open_study(store) as study, process_executor(1) as pool:
+        with pytest.raises(WorkerError):
+            study.run(Deadly(1), 4, executor=pool, attempts=1)
+        assert [t.status for t in study.trials()] == ["done", "running"]
+        with pytest.raises(StudyError, match=r"the trials \[1\] were begun and are not told.*tell them or let them fail"):
+            study.run(Toy(), 4, attempts=1)
+        study.fail(1, "the operator looked: it never started")
+        study.run(Toy(), 4, attempts=1)
+        assert len(study.trials()) == 4
+
+
+def test_an_evaluation_that_no_worker_can_read_is_no_trials_fault(store):
+    with open_study(store) as study, process_executor(1) as pool:
+        with pytest.raises(WorkerError, match="a worker gave no result"):
+            study.run(OnlyHere(), 4, executor=pool)
+        (trial,) = study.running()
+        assert trial.losses == 0
+        study.run(Toy(), 4, executor=pool)
+        assert [t.status for t in study.trials()] == ["done"] * 4
 
 
 def test_what_does_not_pickle_is_refused_before_the_first_trial(store):

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from study_toy import CONFIG, SPACE, Halfway, Toy, ToyEpisode, essence, open_study
+from study_toy import CONFIG, SEED, SPACE, Halfway, Toy, ToyEpisode, essence, open_study
 
 from chargetune.episode.score import Score
 from chargetune.model.parameters import Parameter, ParameterSpace
@@ -24,6 +24,17 @@ class Fixed:
 
     def ask(self, space, trials, n=1):
         return np.array(self.thetas)
+
+
+@dataclass(frozen=True)
+class Sees:
+    """A tuner whose proposals depend on which trials are running."""
+
+    tuner: Halfway
+
+    def ask(self, space, trials, n=1):
+        shift = 1e-3 * sum(t.number + 1 for t in trials if t.status == "running")
+        return np.clip(self.tuner.ask(space, trials, n) - [[shift, 0.0]], [[0.0, 0.1]], None)
 
 
 def uninterrupted(tmp_path, trials=24, **changes):
@@ -77,6 +88,79 @@ def test_workers_and_order_of_finishing_do_not_matter(store, tmp_path, batch, wo
     with open_study(store, batch=batch) as study, ThreadPoolExecutor(workers) as pool:
         study.run(late_first, 12, executor=pool)
         assert essence(study.trials()) == uninterrupted(tmp_path, 12, batch=batch)
+
+
+def test_one_worker_gives_the_trials_of_batches_of_one(store, tmp_path):
+    with open_study(store) as study, ThreadPoolExecutor(1) as pool:
+        study.run(Toy(), 12, executor=pool, workers=1)
+        assert essence(study.trials()) == uninterrupted(tmp_path, 12)
+        assert all(t.provenance["pending"] == [] for t in study.trials())
+
+
+def test_a_free_worker_is_given_a_new_theta_at_once(store):
+    """Trial 0 ends when trial 5 has begun: with batches that would wait for ever."""
+    sixth = threading.Event()
+
+    def evaluate(theta, seed):
+        if seed == trial_seed(SEED, 5):
+            sixth.set()
+        if seed == trial_seed(SEED, 0):
+            assert sixth.wait(30)
+        return Toy()(theta, seed)
+
+    with open_study(store) as study, ThreadPoolExecutor(3) as pool:
+        told = []
+        study.run(evaluate, 9, executor=pool, workers=3, progress=lambda trial, *_: told.append(trial.number))
+        trials = study.trials()
+    assert sorted(told) == list(range(9))
+    assert told.index(0) >= 4
+    assert [t.provenance["pending"] for t in trials[:3]] == [[], [0], [0, 1]]
+    assert all(0 in t.provenance["pending"] for t in trials[1:6])
+    assert all(len(t.provenance["pending"]) <= 2 for t in trials)
+
+
+def test_a_theta_proposed_beside_pending_trials_can_be_found_again_from_the_record(store):
+    def evaluate(theta, seed):
+        threading.Event().wait(0.004 * (seed % 4))
+        return Toy()(theta, seed)
+
+    with open_study(store, tuner=Sees(Halfway(3))) as study, ThreadPoolExecutor(3) as pool:
+        study.run(evaluate, 14, executor=pool, workers=3)
+        trials = study.trials()
+        assert any(len(t.provenance["pending"]) == 2 for t in trials)
+        for t in trials:
+            pending = t.provenance["pending"]
+            asked = [replace(b, status="running", score=None) if b.number in pending else b for b in trials[: t.number]]
+            np.testing.assert_array_equal(study.tuner.ask(SPACE, asked, 1), [t.theta])
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_ctrl_c_among_workers_and_going_on(store, workers):
+    calls = []
+
+    def interrupted(theta, seed):
+        calls.append(seed)
+        if len(calls) in {4, 11}:
+            raise KeyboardInterrupt
+        return Toy()(theta, seed)
+
+    for _ in range(2):
+        with open_study(store) as study, ThreadPoolExecutor(workers) as pool:
+            with pytest.raises(KeyboardInterrupt):
+                study.run(interrupted, 24, executor=pool, workers=workers)
+            assert 1 <= len(study.running()) <= workers
+    with open_study(store) as study:
+        study.run(Toy(), 24)
+        trials = study.trials()
+    assert [t.number for t in trials] == list(range(24))
+    assert not any(t.status == "running" or t.losses > 0 for t in trials)
+
+
+@pytest.mark.parametrize("change", [{"workers": 0}, {"workers": True}, {"workers": 1.0}, {"attempts": 0}, {"attempts": None}])
+def test_bad_workers_and_attempts(store, change):
+    ((name, value),) = change.items()
+    with open_study(store) as study, pytest.raises(ValueError, match=f"{name} = {value}, allowed is an integer >= 1"):
+        study.run(Toy(), 3, **change)
 
 
 def test_stopping_within_a_batch_and_going_on_is_one_study(store, tmp_path):

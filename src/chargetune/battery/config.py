@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,10 @@ from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.plants.sensors import Sensors
 
-__all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "problem_of_document"]
+__all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "problem_of_document", "read_tables"]
 
 
+T = TypeVar("T", bound=BaseModel)
 TunerName = Literal["default", "ei", "sobol", "twin", "envelope"]
 RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
@@ -305,12 +306,17 @@ def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def load_config(path: str | Path) -> Config:
     """Read a study file. Raises FileNotFoundError, and ValueError naming file, field, value and what is allowed."""
+    return read_tables(path, Config)
+
+
+def read_tables(path: str | Path, model: type[T]) -> T:
+    """Read a TOML file of this form. Raises as `load_config`."""
     try:
         data = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"{path} is not valid TOML: {error}") from error
     try:
-        return Config.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
         raise ValueError("\n".join(f"{path}: {_plain(problem)}" for problem in error.errors())) from None
 

@@ -59,8 +59,8 @@ def make_tuner(
     return makers[name](seed)
 
 
-def open_study(store: Store, config: Config, folder: Path | None = None) -> Study:
-    """The study of a configuration, begun or resumed."""
+def open_study(store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False) -> Study:
+    """The study of a configuration, begun or resumed; see `Study.create_or_resume`."""
     problem = config.problem(folder)
     return Study.create_or_resume(
         store,
@@ -70,6 +70,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None) -> Stud
         tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem)),
         seed=config.study.seed,
         batch=config.study.batch,
+        accept_changed=accept_changed,
     )
 
 

@@ -55,15 +55,42 @@ def tune(
     store: Annotated[
         str | None, typer.Option(help="Where trials are kept, a file or postgresql://...; by default OUT/study.sqlite or CONFIG's name.")
     ] = None,
-    workers: Workers = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes: for the batches of the file, else a trial each.")] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
+    accept_changed: Annotated[bool, typer.Option("--accept-changed", help="Resume although the study file has changed.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
     from chargetune.cli.tune import tune_command
 
-    tune_command(config, trials=trials, seed=seed, store=store, workers=workers, out=out, force=force, as_json=as_json)
+    tune_command(
+        config,
+        trials=trials,
+        seed=seed,
+        store=store,
+        workers=workers,
+        out=out,
+        force=force,
+        accept_changed=accept_changed,
+        as_json=as_json,
+    )
+
+
+@app.command()
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="Campaign file (TOML): study files and seeds.", show_default=False)],
+    store: Annotated[
+        str | None, typer.Option(help="Where all trials are kept, a file or postgresql://...; by default CAMPAIGN's name.")
+    ] = None,
+    workers: Workers = 2,
+    force: Annotated[bool, typer.Option("--force", help="Tune although the check of a formulation finds an error.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Tune many study files with many seeds. The same command again resumes."""
+    from chargetune.cli.campaign import campaign_command
+
+    campaign_command(file, store=store, workers=workers, force=force, as_json=as_json)
 
 
 @app.command()

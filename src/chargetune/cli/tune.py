@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,7 @@ def tune_command(
     out: Path | None,
     as_json: bool,
     force: bool = False,
+    accept_changed: bool = False,
 ) -> None:
     """Tune, show the way there, and say what came of it. An error of the formulation stops before the first trial, unless ``force``."""
     config = load_config(path)
@@ -66,7 +68,8 @@ def tune_command(
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
     _check(problem, config.safe_start(problem), force=force)
-    everything, safety = _run(config, path.parent, problem, kept, count, workers, quiet=as_json)
+    opening = Opening(config, path.parent, kept, accept_changed)
+    everything, safety = _run(opening, problem, count, workers, quiet=as_json)
     best = tuned_trial(everything, config.study.tuner)
     figures: list[Path] = []
     if out is not None:
@@ -90,13 +93,22 @@ def tune_command(
     _end(safety)
 
 
-def _run(
-    config: Config, folder: Path, problem: ChargingProblem, kept: str, count: int, workers: int, *, quiet: bool
-) -> tuple[list[Trial], dict[str, Any] | None]:
+@dataclass(frozen=True)
+class Opening:
+    """Where a study comes from and where its trials are kept."""
+
+    config: Config
+    folder: Path
+    kept: str
+    accept_changed: bool
+
+
+def _run(opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool) -> tuple[list[Trial], dict[str, Any] | None]:
     """The trials of the study, and what there is to say of safety."""
+    config, kept = opening.config, opening.kept
     with ExitStack() as stack:
-        opened = stack.enter_context(Store(kept))
-        study = stack.enter_context(open_study(opened, config, folder))
+        store = stack.enter_context(Store(kept))
+        study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed))
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
@@ -117,7 +129,11 @@ def _run(
 
         stopped = ""
         try:
-            study.run(problem, count, executor=executor, progress=note)
+            # Without batches more workers have something to do only if the order of the trials is given up for them; and
+            # not with a tuner whose every step needs the trial before it.
+            alone = study.batch > 1 or config.safety is not None or config.study.tuner == "envelope"
+            ahead = workers if workers > 1 and not alone else None
+            study.run(problem, count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
         everything = study.trials()[:count]

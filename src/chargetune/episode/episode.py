@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.control.sqp import SolveStatus
+from chargetune.episode.notebook import curves, facts
 from chargetune.plants.plant import Measurement, Plant
 
 __all__ = ["BLIND_MAX", "Ending", "Episode", "Trip", "ending_at", "tripped"]
@@ -115,6 +116,16 @@ class Episode:
         names = ("input_names", "output_names", "input_units", "output_units", "estimate_names")
         values: dict[str, Any] = {**arrays, **{name: tuple(meta[name]) for name in names}}
         return cls(sampling_time_s=float(meta["sampling_time_s"]), ending=Ending(meta["ending"]), message=str(meta["message"]), **values)
+
+    def _repr_html_(self) -> str:
+        head: dict[str, str | float] = {
+            "ending": f"{self.ending.value} {self.message}".strip(),
+            "intervals": f"{len(self)} of {self.sampling_time_s:g} s",
+            "steps not solved": self.failures,
+        }
+        inputs = {f"{n} ({u})": self.input[:, i] for i, (n, u) in enumerate(zip(self.input_names, self.input_units, strict=True))}
+        outputs = {f"{n} ({u})": self.output_end[:, i] for i, (n, u) in enumerate(zip(self.output_names, self.output_units, strict=True))}
+        return facts("Episode", head) + curves(self.time_s / 60.0, {**inputs, **outputs})
 
     def cut(self, length: int, ending: Ending, message: str) -> Episode:
         """The first ``length`` intervals, with another ending."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from chargetune.episode.notebook import facts, table
+
 __all__ = ["Score"]
 
 
@@ -39,3 +41,8 @@ class Score:
     def feasible(self) -> bool:
         """Whether every limit was kept within its tolerance."""
         return all(value <= self.tolerance.get(name, 0.0) for name, value in self.excess.items())
+
+    def _repr_html_(self) -> str:
+        limits = [(n, e, self.tolerance.get(n, 0.0), e <= self.tolerance.get(n, 0.0)) for n, e in self.excess.items()]
+        head = facts("Score", {"limits kept": self.feasible, "objective": self.objective, "performance": self.performance, **self.metrics})
+        return head + (table(("limit", "worst excess", "tolerance", "kept"), limits) if limits else "")

@@ -48,8 +48,9 @@ class TwinTuner:
 
     Each theta solves max objective s.t. excess <= tolerance, in every window where the score has a profile, on the
     simulated closed loop with the twin at its posterior mode plus the mean discrepancy (`Search`), from the ``starts`` best of
-    ``pool`` Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. Further thetas of a batch are
-    best on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
+    ``pool`` Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. Further thetas of a batch, and
+    those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same thetas.
+    Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
@@ -72,7 +73,8 @@ class TwinTuner:
         """``n`` thetas, shape (n, d). Raises ValueError when n is no count, `NoSafeThetaError`."""
         check_count(n)
         if self.safety:
-            return np.tile(self._safe(space, trials, self.safety), (n, 1))
+            # A trial that is running has shown nothing yet.
+            return np.tile(self._safe(space, [t for t in trials if t.status != "running"], self.safety), (n, 1))
         belief = believe(self.loop, trials) if trials else None
         if belief is None or belief.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
@@ -86,8 +88,13 @@ class TwinTuner:
             )
             return ConstrainedLogEI(self.seed).ask(space, trials, n)
         first = self._points(space, trials)
-        plants = [belief.central, *(belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n - 1))]
+        drawn = [belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n)]
+        # What is best on the expected plant is on its way already when a trial is running.
+        pending = any(t.status == "running" for t in trials)
+        plants = drawn if pending else [belief.central, *drawn[: n - 1]]
         thetas = [space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants]
+        if pending:
+            return np.array(thetas)
         predicted = belief.predict(thetas[0], DRAWS, self.seed + 7919 * len(trials))
         return np.array([self._polished(space, belief, thetas[0], predicted, CAUTION), *thetas[1:]])
 

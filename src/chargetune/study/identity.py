@@ -58,7 +58,7 @@ def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_cha
     shown = "".join(f"\n  {line}" for line in lines[:SHOWN]) + (f"\n  and {len(lines) - SHOWN} more" if len(lines) > SHOWN else "")
     raise StudyError(
         f"study {record.name!r} was begun with something else:{shown}\n"
-        "Undo the change, begin a study with another name, or resume with accept_changed=True"
+        "Undo the change, begin a study with another name, or resume with accept_changed=True (tune --accept-changed)"
     )
 
 

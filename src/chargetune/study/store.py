@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -239,7 +240,7 @@ class Store:
                 ending=ending,
                 told_at=utc_now(),
                 trace_sha256=hashed,
-                provenance=provenance,
+                provenance={**stored.provenance, **provenance},
             )
             if stored.status is not TrialStatus.RUNNING:
                 if result_of(stored) == result_of(told):
@@ -255,6 +256,19 @@ class Store:
             return told
 
         return self._write(finish, study_id, term)
+
+    def count_loss(self, study_id: int, number: int, by: int = 1, *, term: int | None = None) -> int:
+        """Add to how many workers a running trial has lost, and give that number."""
+        where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
+
+        def count(connection: Connection) -> int:
+            provenance = json.loads(connection.execute(select(schema.trial.c.provenance).where(*where)).scalar_one())
+            provenance["losses"] = provenance.get("losses", 0) + by
+            text = canonical_json(provenance, "provenance")
+            connection.execute(update(schema.trial).where(*where).values(provenance=text))
+            return int(provenance["losses"])
+
+        return self._write(count, study_id, term)
 
     def hold(self, study_id: int) -> Hold | None:
         """Take a study for this process, None when another process has it."""

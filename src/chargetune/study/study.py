@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
@@ -21,9 +21,13 @@ from chargetune.model.parameters import ParameterSpace
 from chargetune.study.database import Hold
 from chargetune.study.document import score_to_json
 from chargetune.study.evaluation import Evaluate, trial_seed
+from chargetune.study.executors import process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
+from chargetune.study.notebook import study_html, trials_dataframe
+from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.runner import WorkerError, check_crosses, outcomes
+from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
+from chargetune.study.schedule import Schedule
 from chargetune.study.store import Store, StudyRecord
 from chargetune.study.trace import Traceable, encode
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
@@ -46,7 +50,8 @@ class Study:
 
     Trials belong to batches of ``batch`` consecutive numbers, beginning with 0. In `run` a batch is proposed from the trials of
     the batches before it and from nothing else, when all of them are told. So the trials depend on neither the number of workers,
-    nor the order in which they finish, nor interruptions, nor on how often ``trials`` was raised.
+    nor the order in which they finish, nor interruptions, nor on how often ``trials`` was raised. Only ``run(workers=...)`` with
+    more than one worker gives this up, for workers that never wait.
     """
 
     store: Store
@@ -123,6 +128,14 @@ class Study:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
         return best_performance(self.trials())
 
+    def trials_dataframe(self) -> Any:
+        """All trials as a pandas data frame, see `trials_dataframe`. Raises ImportError without pandas."""
+        return trials_dataframe(self.space, self.trials())
+
+    def _repr_html_(self) -> str:
+        about = {"tuner": type(self.tuner).__name__, "store": self.store.label}
+        return study_html(self.record.name, about, self.space, self.trials())
+
     def trace(self, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
         """Arrays and metadata of a trial's episode, None when none was stored."""
         return self.store.trace(self.record.id, number)
@@ -193,39 +206,82 @@ class Study:
         trials: int,
         *,
         executor: Executor | None = None,
-        progress: Callable[[Trial, Trial | None, int, int], None] | None = None,
+        workers: int | None = None,
+        attempts: int = 3,
+        progress: Progress | bool | None = None,
     ) -> Trial | None:
         """Evaluate until the study has ``trials`` told trials, and return the best feasible one.
 
-        Trials that a dead process left running are evaluated first, again, with the same theta and seed; on hardware that is
-        refused (StoreError) for one that was handed out. What ``evaluate`` raises makes that trial failed and the study goes on.
-        ``executor`` belongs to the caller, None evaluates in this process. ``progress`` receives the trial told last, the best
-        feasible trial, the number of done trials that broke a limit and the number of failed trials.
+        executor
+            Any executor of the caller's; None evaluates in this process, or with ``workers`` in processes of its own.
+        workers
+            None: batch after batch, each when the one before it is told; the trials depend on nothing but the study. A number:
+            so many trials are under way at once, and as soon as one is told the next theta is proposed, with those under way as
+            pending points. One worker gives the trials of a study in batches of 1; with more they depend on the order in which
+            evaluations end. Each trial's provenance says which were ``pending`` when it was proposed.
+        attempts
+            A trial whose worker was lost is evaluated again until so many workers were lost by it; then it has failed. Losses are
+            counted in the store. With 1, and always on hardware, nothing is repeated: a trial that was begun and is not told stops
+            the study until somebody tells it or lets it fail.
+        progress
+            Receives the trial told last, the best feasible trial, the number of done trials that broke a limit, and of failed ones.
+            True shows a bar, in a notebook as a widget (`tqdm.auto`, extra ``notebook``).
 
-        On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt passes on; the same call resumes.
-        Raises ValueError for bad arguments, WorkerError when a worker process dies.
+        Trials that a dead process left running are evaluated first, again, with the same theta and seed. What ``evaluate`` raises
+        makes that trial failed and the study goes on. On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt
+        passes on; the same call resumes.
+        Raises ValueError for bad arguments, WorkerError when the executor gives no results, StudyError for trials that may not be
+        repeated.
         """
-        if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
-            raise ValueError(f"trials = {trials!r}, allowed is an integer >= 1")
-        check_crosses(evaluate, executor)
-        known = self.trials()
-        incumbent = best_feasible(known)
-        violating = sum(t.score is not None and not t.score.feasible for t in known)
-        failures = sum(t.status is TrialStatus.FAILED for t in known)
-        todo = [t for t in known if t.status is TrialStatus.RUNNING] or self.ask_batch(trials)
-        while todo:
-            # Here one begins when the one before is told, and is handed out then: a crash concerns it alone.
-            for some in [[t] for t in todo] if executor is None else [todo]:
-                with closing(outcomes(evaluate, self.hand_out(some), executor)) as finished:
-                    for trial, outcome in finished:
-                        told = self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt)
-                        incumbent = best_feasible([t for t in (incumbent, told) if t is not None])
-                        violating += told.score is not None and not told.score.feasible
-                        failures += told.status is TrialStatus.FAILED
-                        if progress is not None:
-                            progress(told, incumbent, violating, failures)
-            todo = self.ask_batch(trials)
-        return incumbent
+        for name, value in (("trials", trials), ("attempts", attempts), ("workers", 1 if workers is None else workers)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} = {value!r}, allowed is an integer >= 1")
+        with ExitStack() as stack:
+            if executor is None and workers is not None:
+                executor = stack.enter_context(process_executor(workers))
+            check_crosses(evaluate, executor)
+            known = self.trials()
+            if isinstance(progress, bool):
+                progress = stack.enter_context(progress_bar(known, trials)) if progress else None
+            tally = Tally(known, progress)
+            left = [t for t in known if t.status is TrialStatus.RUNNING]
+            attempts = 1 if self.record.hardware else attempts
+            begun = [t for t in left if t.attempt]
+            if begun and attempts == 1:
+                raise StudyError(
+                    f"the trials {[t.number for t in begun]} were begun and are not told; whether their plant ran is not known, and"
+                    f" {'on hardware' if self.record.hardware else 'with attempts = 1'} nothing is repeated: tell them or let them fail"
+                )
+            # In this process the first loss is not counted: nobody was left to do it.
+            uncounted = executor is None
+            for trial in [t for t in begun if t.losses + uncounted >= attempts]:
+                tally.add(self.finish(trial.number, None, None, lost(trial.losses + uncounted)))
+                left.remove(trial)
+            schedule = Schedule(
+                left=[t for t in left if t.losses <= 0],
+                suspects=[t for t in left if t.losses > 0],
+                batch=lambda: self.ask_batch(trials),
+                one=lambda: self._ask_ahead(trials),
+                workers=workers,
+            )
+
+            def following(busy: int) -> Trial | None:
+                trial = schedule(busy)
+                return None if trial is None else self.hand_out([trial])[0]
+
+            losses = Losses({t.number for t in begun}, attempts, partial(self.store.count_loss, self.record.id, term=self.term))
+            finished = stack.enter_context(closing(outcomes(evaluate, following, executor, losses)))
+            for trial, outcome in finished:
+                tally.add(self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt))
+            return tally.incumbent
+
+    def _ask_ahead(self, limit: int) -> list[Trial]:
+        """One more trial while others are running; none when there are ``limit`` trials."""
+        trials = self.trials()
+        if len(trials) >= limit:
+            return []
+        pending = [t.number for t in trials if t.status is TrialStatus.RUNNING]
+        return self._record(len(trials), self._propose(trials, 1), {"pending": pending})
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
         traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in trials]
@@ -243,8 +299,8 @@ class Study:
             # A trace of the caller's own shape is kept for the caller, and is nothing that a tuner can read.
             return None
 
-    def _record(self, first: int, thetas: Sequence[tuple[float, ...]]) -> list[Trial]:
-        now, made_with = utc_now(), self._provenance()
+    def _record(self, first: int, thetas: Sequence[tuple[float, ...]], more: Mapping[str, Any] | None = None) -> list[Trial]:
+        now, made_with = utc_now(), {**self._provenance(), **(more or {})}
         trials = [
             Trial(number, theta, seed=trial_seed(self.seed, number), asked_at=now, provenance=made_with)
             for number, theta in enumerate(thetas, start=first)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from chargetune.episode.notebook import facts
 from chargetune.episode.score import Score
 
 __all__ = ["Trial", "TrialStatus", "best_feasible", "best_performance"]
@@ -39,7 +40,8 @@ class Trial:
     trace_sha256
         SHA-256 of the stored trace, None when there is none.
     provenance
-        Hash of the study's configuration, versions of the programs, machine.
+        Hash of the study's configuration, versions of the programs, machine; ``pending``: numbers of the trials that were
+        running when it was proposed beside them; ``losses``: how many workers were lost by it.
     attempt
         How often the trial was handed out to a worker; the result of an attempt before the last one is refused.
     episode
@@ -66,9 +68,19 @@ class Trial:
             raise ValueError(f"trial {self.number}: status = {self.status}, a score belongs to the status 'done' and only to it")
 
     @property
+    def losses(self) -> int:
+        """How many workers were lost while they evaluated it."""
+        return int(self.provenance.get("losses", 0))
+
+    @property
     def feasible(self) -> bool:
         """Whether the trial is done and kept every limit."""
         return self.score is not None and self.score.feasible
+
+    def _repr_html_(self) -> str:
+        theta = ", ".join(f"{value:.5g}" for value in self.theta)
+        head = facts(f"Trial {self.number}", {"status": self.status.value, "ending": self.ending, "theta": theta, "seed": str(self.seed)})
+        return head + (self.score._repr_html_() if self.score is not None else "")
 
 
 def best_feasible(trials: Iterable[Trial]) -> Trial | None:

@@ -1,0 +1,78 @@
+"""Bad use of the commands: refused with exit code 2 and one message, before a store is made."""
+
+import json
+import sys
+
+import pytest
+
+from chargetune.cli import main
+
+STUDY = """
+[study]
+name = "NAME"
+tuner = "sobol"
+trials = 2
+[controller]
+mismatch_seed = 1
+[episode]
+steps = 60
+[theta.backoff]
+nodes = 3
+lower_V = 0.0
+upper_V = 0.2
+"""
+
+
+@pytest.fixture
+def chargetune(monkeypatch, capsys):
+    """The command in this process, which is quicker than a new one: exit code, stdout, stderr on one line."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code or 0
+        else:
+            code = 0
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return run
+
+
+def write(folder, name="a study", steps=60):
+    path = folder / "study.toml"
+    path.write_text(STUDY.replace("NAME", name).replace("steps = 60", f"steps = {steps}"))
+    return path
+
+
+@pytest.mark.parametrize("option", ["--workers=0", "--workers=-1", "--workers=two", "--trials=0", "--trials=-5", "--trials=1.5"])
+def test_bad_numbers(chargetune, tmp_path, option):
+    code, _, said = chargetune("tune", write(tmp_path), "--store", tmp_path / "s.sqlite", option)
+    assert code == 2
+    assert f"Invalid value for '{option.partition('=')[0]}': Input should be " in said
+    assert "greater than or equal to 1" in said or "a valid integer" in said
+    assert not (tmp_path / "s.sqlite").exists()
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "<script>alert(1)</script>", "a/b", "..", "C:\\\\x"])
+def test_bad_names(chargetune, tmp_path, name):
+    code, _, said = chargetune("tune", write(tmp_path, name), "--store", tmp_path / "s.sqlite")
+    assert code == 2
+    assert "study name = " in said
+    assert "allowed are 1 to 100 letters, digits" in said
+    assert sorted(p.name for p in tmp_path.iterdir() if "sqlite" not in p.name) == ["study.toml"]
+
+
+def test_a_changed_file_is_refused_unless_asked(chargetune, tmp_path):
+    store = tmp_path / "s.sqlite"
+    assert chargetune("tune", write(tmp_path), "--store", store)[0] == 0
+    path = write(tmp_path, steps=70)
+    code, _, said = chargetune("tune", path, "--store", store, "--trials", 3)
+    assert code == 2
+    assert "config.episode.steps: 60 -> 70" in said
+    assert "--accept-changed" in said
+    code, out, _ = chargetune("tune", path, "--store", store, "--trials", 3, "--accept-changed", "--json")
+    assert code == 0
+    assert json.loads(out)["trials"] == 3
