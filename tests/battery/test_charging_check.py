@@ -21,7 +21,7 @@ from chargetune.plants.simulated import SimulatedPlant
 
 CELL = default_cell()
 EXAMPLES = Path(__file__).parents[2] / "examples"
-STUDIES = sorted(path for path in EXAMPLES.glob("*.toml") if "[study]" in path.read_text())
+STUDIES = sorted(path for path in EXAMPLES.glob("*.toml") if not {"[ecm]", "[campaign]"} & set(path.read_text().split()))
 R1 = (ResistanceRatio("R1"),)
 
 
