@@ -92,7 +92,14 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
     if plant in DFN:
         return _dfn(*DFN[plant], study, sensors)
     cell = default_cell()
-    problem = ChargingProblem(cell, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **STUDIES[study])  # type: ignore[arg-type]
+    problem = ChargingProblem(
+        cell,
+        mismatch_seed=seed,
+        sensors=sensors,
+        verdict_samples=5,
+        charge_time_to_soc=0.95,
+        **STUDIES[study],  # type: ignore[arg-type]
+    )
     if plant == "structural":
         return replace(problem, plant_model=StructuralPlant(cell))
     if plant == "unknown":
@@ -111,7 +118,7 @@ def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors) -
         raise TypeError(f"{EXAMPLE.name} is to describe a cell with a temperature and an electrochemical plant")
     return ChargingProblem(
         replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, verdict_samples=5,
-        current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **STUDIES[study],  # type: ignore[arg-type]
+        charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **STUDIES[study],  # type: ignore[arg-type]
     )  # fmt: skip
 
 

@@ -37,6 +37,27 @@ def test_the_oracle():
     assert score.metrics["solver_failures"] == 0
 
 
+def test_the_objective_may_be_the_time_of_charge():
+    score = score_of(problem(mismatch_seed=None, charge_time_to_soc=0.95))
+    # 360 steps of 10 s are 60 min.
+    assert score.objective == pytest.approx(-score.metrics["t95_min"] / 60, abs=1e-12)
+    assert score.performance == score_of(problem(mismatch_seed=None)).performance
+
+
+def test_a_charge_that_does_not_get_there_is_worse_the_less_it_charges():
+    found = [score_of(problem(mismatch_seed=None, charge_time_to_soc=0.9, steps=steps)) for steps in (30, 60, 160, 210, 220)]
+    assert [s.metrics["t90_min"] is None for s in found] == [True, True, True, False, False]
+    for score in found[:3]:
+        assert score.objective == pytest.approx(-1 - 0.9 + score.metrics["soc_end"], abs=1e-12)
+    assert [s.objective for s in found] == sorted(s.objective for s in found)
+
+
+@pytest.mark.parametrize("value", [0.05, 1.01, NAN])
+def test_the_time_of_charge_ends_above_the_start(value):
+    with pytest.raises(ValueError, match="charge_time_to_soc"):
+        problem(charge_time_to_soc=value)
+
+
 # Case study, section 4: untuned overshoot in mV and t95 in minutes.
 UNTUNED = {0: (38, 39.7), 1: (62, 35.8), 2: (45, 34.5), 3: (113, 37.4), 4: (42, 41.7), 5: (95, 31.8), 6: (58, 37.8), 7: (94, 41.1)}
 

@@ -198,6 +198,8 @@ anode_min_V = 0.0
 hard = ["temperature_max_K"]
 [sensors]
 voltage_noise_sd_V = 0.002
+[objective]
+charge_time_to_soc = 0.8
 [theta.backoff]
 nodes = 3
 [theta.R1]
@@ -229,8 +231,12 @@ def test_the_file_says_all_of_it_and_the_store_gives_it_back(tmp_path):
     assert problem.space.default[-1] == pytest.approx(0.1)
     assert (problem.plant_model.model, problem.plant_model.ambient_K) == ("SPM", 290.0)
     assert problem.backoff == Backoff(nodes=3)
+    assert problem.charge_time_to_soc == 0.8
     document = json.loads(json.dumps(config.document(tmp_path)))
     assert problem_of_document(document) == problem
+    # Studies that are older than this choice resume.
+    (tmp_path / "study.toml").write_text(FILE.replace("charge_time_to_soc = 0.8", ""))
+    assert "charge_time_to_soc" not in load_config(tmp_path / "study.toml").document(tmp_path)["objective"]
 
 
 def test_a_charge_on_an_electrochemical_plant_within_its_limits():

@@ -15,7 +15,7 @@ from chargetune.battery.checks import check_count, check_number
 from chargetune.battery.ecm import ecm_model, overpotentials, start_state
 from chargetune.battery.estimation import Kalman
 from chargetune.battery.limits import HARD_FACTOR, SIGNALS, Kind, Limit
-from chargetune.battery.metrics import charging_metrics
+from chargetune.battery.metrics import charging_metrics, crossing_minutes
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.control.controller import Controller, SoftLimit, Stage
 from chargetune.control.estimators import Estimator, ExactState, Propagated
@@ -57,10 +57,11 @@ class ChargingProblem:
     gives it the plant's; a ``kalman`` filter instead estimates SOC and overpotentials from voltage and current.
     ``soc_start_error`` is what the controller believes of the SOC at the start less the truth.
     Objective of the paper: G = -sum_{k=0..K} c1 (z_d - z_k)^2 - sum_{k<K} max(0, V_k - v_max)^2, V_k the larger of the
-    voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; each limit
-    is scored on its own, upper voltage, temperature and anode potential also in ``soc_windows`` equal parts of the SOC,
-    and as moving mean over ``verdict_samples`` intervals where the signal's sensor has noise: then three standard deviations of
-    that mean belong to the tolerance, since they are no violation that was seen.
+    voltages at both ends of interval k. The constrained objective is the mean of -(z_d - z_k)^2 without c1; with
+    ``charge_time_to_soc`` z* it is -t/T instead, t the time to z* and T that of the episode, or -(1 + z* - z_K) where the charge
+    ends at z_K below z*. Each limit is scored on its own, upper voltage, temperature and anode potential also in ``soc_windows``
+    equal parts of the SOC, and as moving mean over ``verdict_samples`` intervals where the signal's sensor has noise: then three
+    standard deviations of that mean belong to the tolerance, since they are no violation that was seen.
     ``abort_margin_V`` and ``abort_margin_K`` end an episode as soon as a measured voltage or temperature is so far beyond its
     upper limit: the plant is closed, its current is 0, the trial failed and its trace is kept.
     Limits that the controller's model predicts are kept by it softly; ``hard`` and ``scored_only`` name the exceptions.
@@ -100,6 +101,7 @@ class ChargingProblem:
     voltage_spread: MeasurementSpread | None = None
     abort_margin_V: float | None = None
     abort_margin_K: float | None = None
+    charge_time_to_soc: float | None = None
 
     def __post_init__(self) -> None:
         cell = self.plant_cell
@@ -109,6 +111,8 @@ class ChargingProblem:
         check_number("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
         start = check_number("soc_start", self.soc_start, 0.0, 1.0, "")
         target = check_number("soc_target", self.soc_target, 0.0, 1.0, "")
+        if self.charge_time_to_soc is not None:
+            check_number("charge_time_to_soc", self.charge_time_to_soc, start, 1.0, "", open_low=True)
         least = check_number("current_min_A", self.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
         most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
         highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
@@ -347,13 +351,19 @@ class ChargingProblem:
         for limit in self.limits[2:]:
             metrics |= limit.metrics(episode)
         return Score(
-            objective=-float(np.mean(deficit)),
+            objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(soc),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
             excess={name: float(np.max(values)) for name, values in excess.items()},
             tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
             metrics=metrics,
             profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
         )
+
+    def _quickness(self, soc: NDArray[np.float64]) -> float:
+        wanted = self.charge_time_to_soc or 0.0
+        time = np.arange(soc.size + 1) / soc.size
+        reached = crossing_minutes(60 * time, np.concatenate([[self.soc_start], soc]), wanted)
+        return -float(reached if reached is not None else 1.0 + wanted - soc[-1])
 
     def judged(self, limit: Limit) -> tuple[int, float]:
         """(intervals of the moving mean, excess still called kept): of a noisy signal what `NOISE_SD` sd of that mean may be."""

@@ -136,9 +136,13 @@ class SensorTable(_Table):
 
 
 class ObjectiveTable(_Table):
-    """c1 of the paper's scalar performance G; SOC windows in which an excess is told to the tuner; intervals in its moving mean."""
+    """c1 of the paper's scalar performance G; the SOC to which the time of charge is minimised, else the mean squared lack of charge.
+
+    SOC windows in which an excess is told to the tuner; intervals in its moving mean.
+    """
 
     c1: float = 1e-5
+    charge_time_to_soc: float | None = None
     soc_windows: int = 5
     verdict_samples: int = 1
 
@@ -281,6 +285,9 @@ class Config(_Table):
         data["cell"] = json.loads(json.dumps(asdict(cell)))
         data["theta"].pop("values")
         data["study"] = {"tuner": self.study.tuner}
+        # What is not given leaves no entry, that studies of before it resume.
+        if self.objective.charge_time_to_soc is None:
+            del data["objective"]["charge_time_to_soc"]
         if self.safety is None:
             del data["safety"]
         return data
