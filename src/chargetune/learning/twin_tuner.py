@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
+from threadpoolctl import threadpool_limits
 
 from chargetune.learning.belief import Belief, Prediction, TwinLoop, believe, episodes_of, windows_of
 from chargetune.learning.constrained import ConstrainedLogEI
@@ -28,6 +29,8 @@ MISTAKEN = 3.5
 DRAWS = 48
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
+# A round that moves no entry by more than this share of its range was the last one.
+SETTLED = 2e-3
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
@@ -72,6 +75,11 @@ class TwinTuner:
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
         """``n`` thetas, shape (n, d). Raises ValueError when n is no count, `NoSafeThetaError`."""
         check_count(n)
+        # Its matrices are small: a second thread mostly waits, and on a busy machine it waits ten times as long as one works.
+        with threadpool_limits(1):
+            return self._ask(space, trials, n)
+
+    def _ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int) -> NDArray[np.float64]:
         if self.safety:
             # A trial that is running has shown nothing yet.
             return np.tile(self._safe(space, [t for t in trials if t.status != "running"], self.safety), (n, 1))
@@ -135,7 +143,9 @@ class TwinTuner:
                 deviations *= WIDER
             following = covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
             # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
-            theta = following if k < 1 else (theta + following) / 2
+            theta, before = following if k < 1 else (theta + following) / 2, theta
+            if passed and np.max(np.abs(theta - before) / (space.upper - space.lower)) < SETTLED:
+                break
         if not passed:
             return self._tried(trials, belief, safety, seed)
         theta = max(passed, key=lambda one: one[0])[1]
