@@ -11,7 +11,7 @@ from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import canonical_json, describe, differences, space_to_json
 from chargetune.study.records import StudyRecord
 
-__all__ = ["StudyError", "check_change", "study_identity"]
+__all__ = ["StudyError", "check_change", "parameters_of", "study_identity"]
 
 NAME = re.compile(r"[^\W_](?:[\w .,+=:@()-]{0,98}[\w.,+=:@()-])?")
 SHOWN = 12
@@ -22,7 +22,15 @@ class StudyError(Exception):
 
 
 def study_identity(
-    name: str, *, config: Mapping[str, Any], space: ParameterSpace, tuner: object, seed: int, batch: int, hardware: bool = False
+    name: str,
+    *,
+    config: Mapping[str, Any],
+    space: ParameterSpace,
+    tuner: object,
+    seed: int,
+    batch: int,
+    hardware: bool = False,
+    earlier: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The identity as JSON data. Raises ValueError naming the argument, its value and what is allowed."""
     if not NAME.fullmatch(name):
@@ -35,8 +43,9 @@ def study_identity(
     if space.dimension == 0:
         raise ValueError("space: no parameters, allowed is at least one")
     identity = {"config": config, "space": space_to_json(space), "tuner": describe(tuner), "seed": seed, "batch": batch}
-    # Only where it is so, that studies of before this entry resume.
+    # Only where they are so, that studies of before these entries resume.
     identity |= {"hardware": True} if hardware else {}
+    identity |= {"earlier": list(earlier)} if earlier else {}
     plain: dict[str, Any] = json.loads(canonical_json(identity, "study"))
     return plain
 
@@ -46,7 +55,7 @@ def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_cha
 
     Other names, sizes or units of the parameters are never accepted: the stored thetas would mean something else.
     """
-    old, new = _parameters(record.identity), _parameters(identity)
+    old, new = parameters_of(record.identity["space"]), parameters_of(identity["space"])
     if old != new:
         raise StudyError(
             f"study {record.name!r} tunes other parameters: {', '.join(old)} -> {', '.join(new)};"
@@ -62,6 +71,6 @@ def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_cha
     )
 
 
-def _parameters(identity: Mapping[str, Any]) -> list[str]:
-    parameters: Sequence[Mapping[str, Any]] = identity["space"]
+def parameters_of(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Name, size and unit of each parameter, as text; two studies with the same ones mean the same by theta."""
     return [f"{p['name']} ({p['size']} x {p['unit']})" for p in parameters]
