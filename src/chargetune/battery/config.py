@@ -20,6 +20,7 @@ from chargetune.battery.estimation import Kalman
 from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio
 from chargetune.plants.sensors import Sensors
+from chargetune.study.earlier import Earlier
 
 __all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "problem_of_document", "read_tables"]
 
@@ -34,14 +35,22 @@ class _Table(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
+class EarlierTable(_Table):
+    """An earlier study whose trials are initial data of this one: its store, a file or postgresql://..., and its name."""
+
+    store: str = Field(min_length=1)
+    study: str = Field(min_length=1)
+
+
 class StudyTable(_Table):
-    """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time."""
+    """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time, earlier studies."""
 
     name: str = Field(default="study", min_length=1, max_length=200)
     tuner: TunerName = "default"
     trials: int = Field(default=60, ge=1)
     seed: int = Field(default=0, ge=0)
     batch: int = Field(default=1, ge=1)
+    earlier: list[EarlierTable] = Field(default_factory=list)
 
 
 class CellTable(_Table):
@@ -277,6 +286,11 @@ class Config(_Table):
         """The theta that the file declares safe."""
         start = self.safety.start if self.safety else None
         return None if start is None else problem.space.from_dict(dict(start))
+
+    def earlier(self, folder: Path | None = None) -> list[Earlier]:
+        """The earlier studies; a relative file is looked for in ``folder``."""
+        here = Path() if folder is None else folder
+        return [Earlier(e.store if "://" in e.store else here / e.store, e.study) for e in self.study.earlier]
 
     def document(self, folder: Path | None = None) -> dict[str, Any]:
         """What decides the trials, as JSON data for the store: the cell's numbers instead of its file, without the number of trials."""

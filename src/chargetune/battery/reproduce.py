@@ -70,6 +70,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem)),
         seed=config.study.seed,
         batch=config.study.batch,
+        earlier=config.earlier(folder),
         accept_changed=accept_changed,
     )
 

@@ -114,6 +114,8 @@ def _run(opening: Opening, problem: ChargingProblem, count: int, workers: int, *
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
         progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
+        if study.earlier and not quiet:
+            progress.console.print(f"begun with {len(study.earlier)} trials of earlier studies")
         if done and not quiet:
             progress.console.print(f"resumed: {done} trials are in {shown(kept)}")
 

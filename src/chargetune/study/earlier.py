@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from chargetune.model.parameters import ParameterSpace
+from chargetune.study.database import store_name
 from chargetune.study.document import space_to_json
 from chargetune.study.identity import StudyError, parameters_of
 from chargetune.study.store import Store, StoreError
@@ -22,6 +23,11 @@ class Earlier:
 
     store: str | os.PathLike[str]
     study: str
+
+    @property
+    def name(self) -> str:
+        """The study and its store without the folder or the password: what a study begun with it remembers."""
+        return f"{self.study} in {store_name(self.store)}"
 
 
 def read_earlier(earlier: Sequence[Earlier], space: ParameterSpace) -> list[tuple[Trial, bytes | None]]:

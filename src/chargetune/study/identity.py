@@ -53,13 +53,20 @@ def study_identity(
 def check_change(record: StudyRecord, identity: Mapping[str, Any], *, accept_changed: bool) -> bool:
     """Whether ``identity`` differs from the stored one; StudyError that lists what differs unless that is accepted.
 
-    Other names, sizes or units of the parameters are never accepted: the stored thetas would mean something else.
+    Other names, sizes or units of the parameters are never accepted: the stored thetas would mean something else. Nor are other
+    earlier studies: their trials are in the store since the study was begun.
     """
     old, new = parameters_of(record.identity["space"]), parameters_of(identity["space"])
     if old != new:
         raise StudyError(
             f"study {record.name!r} tunes other parameters: {', '.join(old)} -> {', '.join(new)};"
             " its trials do not fit, begin a study with another name"
+        )
+    begun, now = record.identity.get("earlier", []), identity.get("earlier", [])
+    if begun != now:
+        raise StudyError(
+            f"study {record.name!r} began with other earlier studies: {', '.join(begun) or '(none)'} -> {', '.join(now) or '(none)'};"
+            " their trials were taken over once, begin a study with another name"
         )
     lines = differences(dict(record.identity), dict(identity))
     if accept_changed or not lines:

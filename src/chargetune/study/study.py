@@ -20,6 +20,7 @@ from chargetune.episode.score import Score
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.database import Hold
 from chargetune.study.document import score_to_json
+from chargetune.study.earlier import Earlier, read_earlier
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
@@ -62,6 +63,7 @@ class Study:
     batch: int
     lease: Hold
     term: int
+    earlier: tuple[Trial, ...] = ()
 
     @classmethod
     def create_or_resume(
@@ -75,6 +77,7 @@ class Study:
         seed: int = 0,
         batch: int = 1,
         hardware: bool = False,
+        earlier: Sequence[Earlier] = (),
         accept_changed: bool = False,
     ) -> Self:
         """The study ``name`` of the store, begun if there is none.
@@ -83,13 +86,20 @@ class Study:
             JSON data that says what an evaluation does. It is compared on resume, together with space, tuner, seed and batch.
         hardware
             The plant is no simulation: a trial is handed out at most once and never repeated by the program.
+        earlier
+            Studies whose told trials are its initial data D_0: the tuner gets them before its own. They are copied when the study is
+            begun, with traces and origin, and keep numbers below 0; `trials` and `best` leave them out.
         accept_changed
-            Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units.
+            Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units, and
+            ``earlier`` must be what it was.
 
         Raises ValueError for bad arguments; StudyError when what is resumed differs, or when another process holds the study.
         """
-        identity = study_identity(name, config=config, space=space, tuner=tuner, seed=seed, batch=batch, hardware=hardware)
-        record = next((r for r in store.studies() if r.name == name), None) or store.add_study(name, identity, hardware=hardware)
+        identity = study_identity(
+            name, config=config, space=space, tuner=tuner, seed=seed, batch=batch, hardware=hardware, earlier=[e.name for e in earlier]
+        )
+        record = next((r for r in store.studies() if r.name == name), None)
+        record = record or store.add_study(name, identity, hardware=hardware, earlier=read_earlier(earlier, space))
         lease = _take_lease(store, record)
         try:
             record = store.study(name)
@@ -100,7 +110,7 @@ class Study:
         except BaseException:
             lease.release()
             raise
-        return cls(store, record, space, tuner, seed, batch, lease, term)
+        return cls(store, record, space, tuner, seed, batch, lease, term, tuple(store.earlier(record.id)) if earlier else ())
 
     def close(self) -> None:
         """Give the study back, so that another process can go on with it. The store stays open."""
@@ -284,7 +294,8 @@ class Study:
         return self._record(len(trials), self._propose(trials, 1), {"pending": pending})
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
-        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in trials]
+        known = [*self.earlier, *trials]
+        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in known]
         thetas = np.asarray(self.tuner.ask(self.space, traced, n), dtype=float)
         if thetas.shape != (n, self.space.dimension):
             raise StudyError(f"the tuner proposed an array of shape {thetas.shape}, expected ({n}, {self.space.dimension})")
