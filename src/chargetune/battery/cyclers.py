@@ -7,7 +7,7 @@ Columns are found by name, as Bitrode, Arbin, Neware, BioLogic and the Battery D
 | time | Time(s), Test_Time(s), Test Time / s, test_time_second, time/s, Total Time, Record Time, Time(h:min:s.ms), Relative Time |
 | current | Current, Current(A), Current(mA), Current / A, current_ampere, Cur(mA), I/mA, <I>/mA, I/A |
 | voltage | Voltage, Voltage(V), Voltage(mV), Voltage / V, voltage_volt, Vol(V), Ecell/V, Ewe/V |
-| temperature | Temperature, Temperature(C), Temperature / degC, Temp(C), T1/degC, Aux_Temperature_1(C) |
+| temperature | Temperature, Temperature(C), Temperature / degC, Surface Temperature / degC, Temp(C), T1/degC, Aux_Temperature_1(C) |
 
 A unit in the name is converted; without one it is s, A, V and degree Celsius; a clock (h:mm:ss) is understood. A time that
 restarts with each step is strung together. Semicolon, tab or comma separates; decimal commas and a byte order mark are
@@ -32,7 +32,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "time": ("testtime", "testtimesecond", "totaltime", "recordtime", "time", "relativetime"),
     "current": ("current", "currentampere", "cur", "<i>", "i"),
     "voltage": ("voltage", "voltagevolt", "vol", "ecell", "<ewe>", "ewe", "v"),
-    "temperature": ("temperature", "temp", "t1", "auxtemperature1", "auxtemp1"),
+    "temperature": ("temperature", "temp", "t1", "temperaturet1", "surfacetemperature", "auxtemperature1", "auxtemp1"),
 }
 CLOCKS = dict.fromkeys(("h:min:s.ms", "h:m:s", "h:mm:ss", "hh:mm:ss", "hh:mm:ss.ms"), 1.0)
 UNITS: dict[str, dict[str, float]] = {

@@ -23,6 +23,17 @@ app = typer.Typer(
 )
 
 
+store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(store_app)
+
+
+class ExportFormat(StrEnum):
+    """What `store export` writes."""
+
+    PARQUET = "parquet"
+    CSV = "csv"
+
+
 class CaseName(StrEnum):
     """The case studies."""
 
@@ -266,6 +277,48 @@ def verify(
     from chargetune.cli.verify import verify_command
 
     verify_command(certificate, as_json=as_json)
+
+
+@store_app.command("check")
+def store_check(store: StoreArgument, as_json: AsJson = False) -> None:
+    """Read the whole store: the database, each trial, each trace's hash; exit code 1 and what is wrong. Changes nothing."""
+    from chargetune.cli.store import check_command
+
+    check_command(store, as_json=as_json)
+
+
+@store_app.command("salvage")
+def store_salvage(
+    store: StoreArgument,
+    new: Annotated[str, typer.Argument(help="New store: a file that is not there yet, or an empty database.", show_default=False)],
+    as_json: AsJson = False,
+) -> None:
+    """Copy what is whole of a damaged store into a new one and name what was left; copies a whole store, too."""
+    from chargetune.cli.store import salvage_command
+
+    salvage_command(store, new, as_json=as_json)
+
+
+@store_app.command("export")
+def store_export(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Option(help="Folder to write to.", show_default=False)],
+    study: Annotated[str | None, typer.Option(help="Name of a study; by default all.")] = None,
+    form: Annotated[ExportFormat, typer.Option("--format", help="Kind of table.")] = ExportFormat.PARQUET,
+    as_json: AsJson = False,
+) -> None:
+    """Write trials and traces as tables, traces with the column names of the Battery Data Format (needs chargetune[export])."""
+    from chargetune.cli.store import export_command
+
+    export_command(store, out=out, study=study, form=form.value, as_json=as_json)
+
+
+@store_app.command("migrate")
+def store_migrate(store: StoreArgument) -> None:
+    """Convert a store of an older version; a copy of the old file stays beside it."""
+    from chargetune.cli.store import migrate_command
+
+    migrate_command(store)
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value

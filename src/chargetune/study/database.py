@@ -41,6 +41,10 @@ class Database(Protocol):
         """Make an empty store where there is nothing yet, and bring an old one to this schema. Raises StoreError."""
         ...
 
+    def find(self) -> None:
+        """Raise StoreError when there is nothing to open; what is there need not be whole."""
+        ...
+
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
         """An engine for the store that `prepare` left."""
         ...

@@ -72,6 +72,9 @@ class PostgresServer:
                 " open it with the program that wrote it"
             )
 
+    def find(self) -> None:
+        """Nothing: whoever asks the server hears it."""
+
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
         """An engine on the server; a transaction with the execution option ``writing`` waits for the one before to end."""
         # Of 0 the server would make "for ever".

@@ -76,7 +76,7 @@ def result_of(trial: Trial) -> tuple[object, ...]:
 
 
 def record_of(row: Row[Any]) -> StudyRecord:
-    """The study of a row of the study table with the column trial_count."""
+    """The study of a row of the study table, which may have a column trial_count."""
     return StudyRecord(
         id=row.id,
         name=row.name,
@@ -85,5 +85,5 @@ def record_of(row: Row[Any]) -> StudyRecord:
         identity_sha256=row.identity_sha256,
         versions=json.loads(row.versions),
         hardware=bool(row.hardware),
-        trial_count=row.trial_count,
+        trial_count=getattr(row, "trial_count", 0),
     )

@@ -59,6 +59,10 @@ class SqliteFile:
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be opened or created ({error.strerror})") from error
 
+    def find(self) -> None:
+        """StoreError unless there is a file."""
+        _is_there(self.path, read_only=True)
+
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
         """An engine on the file; a transaction with the execution option ``writing`` takes the write lock when it begins."""
         return connect_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)

@@ -56,7 +56,7 @@ class Store:
         self._engine = self.database.connect(read_only=read_only, busy_timeout_s=busy_timeout_s)
         if not read_only:
             try:
-                self._write(lambda _: None)
+                self.write(lambda _: None)
             except BaseException:
                 self._engine.dispose()
                 raise
@@ -76,7 +76,7 @@ class Store:
         own = (schema.trial.c.study_id == schema.study.c.id, schema.trial.c.number >= 0)
         count = select(func.count()).where(*own).correlate(schema.study).scalar_subquery()
         query = select(schema.study, count.label("trial_count")).order_by(schema.study.c.id)
-        return [record_of(row) for row in self._read(lambda connection: connection.execute(query).all())]
+        return [record_of(row) for row in self.read(lambda connection: connection.execute(query).all())]
 
     def study(self, name: str) -> StudyRecord:
         """The study of this name; StoreError names those that there are."""
@@ -101,7 +101,7 @@ class Store:
         """
         where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
         query = select(schema.trial.c.trace_sha256, schema.trace.c.data).select_from(schema.trial.outerjoin(schema.trace)).where(*where)
-        row = self._read(lambda connection: connection.execute(query).first())
+        row = self.read(lambda connection: connection.execute(query).first())
         if row is None:
             raise StoreError(f"{self.label}: no trial {number} in this study")
         if row.trace_sha256 is None:
@@ -144,14 +144,14 @@ class Store:
                 connection.execute(insert(schema.trial).values(study_id=study_id, **trial_row(trial)))
                 _add_trace(connection, study_id, trial.number, trace)
 
-        self._write(add)
+        self.write(add)
         return self.study(name)
 
     def change_study(self, study_id: int, identity: Mapping[str, Any], *, term: int | None = None) -> None:
         """Replace what a study is about; the trials so far keep the hash of the old one in their provenance."""
         text = canonical_json(identity, "study")
         query = update(schema.study).where(schema.study.c.id == study_id).values(identity=text, identity_sha256=sha256(text))
-        self._write(lambda connection: connection.execute(query), study_id, term)
+        self.write(lambda connection: connection.execute(query), study_id, term)
 
     def add_trials(self, study_id: int, trials: Sequence[Trial], *, term: int | None = None) -> None:
         """Record trials as running, all or none. Their numbers must go on where the stored ones end."""
@@ -163,13 +163,18 @@ class Store:
         def add(connection: Connection) -> None:
             stored = connection.execute(select(schema.trial).where(*own).order_by(schema.trial.c.number)).all()
             numbers = [trial.number for trial in trials]
+            if stored and stored[-1].number >= len(stored):
+                raise StoreError(
+                    f"{self.label}: this study lacks trials since it was salvaged, and cannot go on;"
+                    " a new study can begin with what it has ([[study.earlier]])"
+                )
             if numbers == list(range(len(stored), len(stored) + len(trials))):
                 connection.execute(insert(schema.trial), rows)
             elif [trial_of(row) for row in stored[-len(trials) :]] != list(trials):
                 # Equal ones are this very transaction, whose answer was lost.
                 raise StoreError(f"{self.label}: trial numbers {numbers} do not follow the {len(stored)} stored ones")
 
-        self._write(add, study_id, term)
+        self.write(add, study_id, term)
 
     def hand_out(self, study_id: int, trials: Sequence[Trial], worker: str, *, term: int | None = None) -> list[Trial]:
         """Record, before they begin, that ``worker`` evaluates running trials; gives them with the number of this attempt.
@@ -205,7 +210,7 @@ class Store:
                 handed.append(replace(trial_of(row), attempt=trial.attempt + 1))
             return handed
 
-        return self._write(hand, study_id, term)
+        return self.write(hand, study_id, term)
 
     def finish_trial(
         self,
@@ -255,7 +260,7 @@ class Store:
             connection.execute(update(schema.trial).where(*where).values(trial_row(told)))
             return told
 
-        return self._write(finish, study_id, term)
+        return self.write(finish, study_id, term)
 
     def count_loss(self, study_id: int, number: int, by: int = 1, *, term: int | None = None) -> int:
         """Add to how many workers a running trial has lost, and give that number."""
@@ -268,7 +273,7 @@ class Store:
             connection.execute(update(schema.trial).where(*where).values(provenance=text))
             return int(provenance["losses"])
 
-        return self._write(count, study_id, term)
+        return self.write(count, study_id, term)
 
     def hold(self, study_id: int) -> Hold | None:
         """Take a study for this process, None when another process has it."""
@@ -292,28 +297,30 @@ class Store:
             connection.execute(update(schema.holder).where(where).values(term=term + 1, **values))
             return term + 1
 
-        return self._write(note)
+        return self.write(note)
 
     def holder(self, study_id: int | None = None) -> str:
         """The process noted last, for one study or for any, as text."""
         query = select(schema.holder).order_by(schema.holder.c.since.desc())
         if study_id is not None:
             query = query.where(schema.holder.c.study_id == study_id)
-        row = self._read(lambda connection: connection.execute(query).first())
+        row = self.read(lambda connection: connection.execute(query).first())
         return "unknown" if row is None else f"process {row.process} on {row.host} since {row.since}"
 
     def _trials(self, study_id: int, which: Any) -> list[Trial]:
         query = select(schema.trial).where(schema.trial.c.study_id == study_id, which).order_by(schema.trial.c.number)
-        return [trial_of(row) for row in self._read(lambda connection: connection.execute(query).all())]
+        return [trial_of(row) for row in self.read(lambda connection: connection.execute(query).all())]
 
-    def _read(self, action: Callable[[Connection], T]) -> T:
+    def read(self, action: Callable[[Connection], T]) -> T:
+        """Run ``action``, which must not write; StoreError for what the database makes of it."""
+
         def once() -> T:
             with self._engine.connect() as connection:
                 return action(connection)
 
         return self._persist(once)
 
-    def _write(self, action: Callable[[Connection], T], study_id: int | None = None, term: int | None = None) -> T:
+    def write(self, action: Callable[[Connection], T], study_id: int | None = None, term: int | None = None) -> T:
         """Run ``action`` as one transaction; more than once when a connection is lost, so it must bear repetition."""
         if self.read_only:
             raise StoreError(f"{self.label}: opened read-only")

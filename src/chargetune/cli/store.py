@@ -1,0 +1,95 @@
+"""chargetune store check, salvage, export and migrate."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from chargetune.battery.export import Format, export
+from chargetune.cli.output import console, shown
+from chargetune.study.check import check_store
+from chargetune.study.readable import Finding
+from chargetune.study.salvage import salvage
+from chargetune.study.store import Store
+
+__all__ = ["check_command", "export_command", "migrate_command", "salvage_command"]
+
+SHOWN = 20
+
+
+def check_command(location: str, *, as_json: bool) -> None:
+    """Read everything in a store; exit code 1 when something is not as it was stored."""
+    with _steps("traces", quiet=as_json) as step:
+        verdict = check_store(location, step)
+    counts = {"studies": verdict.studies, "trials": verdict.trials, "traces": verdict.traces}
+    if as_json:
+        print(json.dumps({"store": verdict.store, **counts, "findings": _facts(verdict.findings)}))  # noqa: T201
+    else:
+        _lines(list(map(str, verdict.findings)))
+        closing = f"{len(verdict.findings)} findings" if verdict.findings else "nothing wrong"
+        remedy = "\n`chargetune store salvage STORE NEW` saves what is whole into a new store" if verdict.findings else ""
+        console().print(f"{verdict.store}: {_counted(counts)} are whole; {closing}{remedy}", markup=False, soft_wrap=True)
+    if verdict.findings:
+        sys.exit(1)
+
+
+def salvage_command(location: str, target: str, *, as_json: bool) -> None:
+    """Copy what is whole, and name what was left."""
+    with _steps("traces", quiet=as_json) as step:
+        saved = salvage(location, target, step)
+    counts = {"studies": saved.studies, "trials": saved.trials, "traces": saved.traces}
+    if as_json:
+        print(json.dumps({"store": saved.store, **counts, "left": _facts(saved.left)}))  # noqa: T201
+        return
+    _lines([f"left: {finding}" for finding in saved.left])
+    closing = f"{len(saved.left)} findings" if saved.left else "nothing was left"
+    console().print(f"{saved.store}: {_counted(counts)} saved; {closing}", markup=False, soft_wrap=True)
+
+
+def export_command(location: str, *, out: Path, study: str | None, form: Format, as_json: bool) -> None:
+    """Write trials and traces as tables."""
+    with Store(location, read_only=True) as store, _steps("trials", quiet=as_json) as step:
+        try:
+            written = export(store, out, study=study, form=form, step=step)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
+    if as_json:
+        print(json.dumps({"files": [str(f) for f in written.files], "left": list(written.left)}))  # noqa: T201
+        return
+    _lines([f"left: {line}" for line in written.left])
+    console().print(f"{len(written.files)} files in {out}", markup=False, soft_wrap=True)
+
+
+def migrate_command(location: str) -> None:
+    """Bring a store of an older schema to this one; opening it for writing does that."""
+    with Store(location):
+        pass
+    console().print(f"{shown(location)}: has this program's schema", markup=False, soft_wrap=True)
+
+
+def _facts(findings: Sequence[Finding]) -> list[dict[str, object]]:
+    return [{"study": f.study, "trial": f.trial, "what": f.what} for f in findings]
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in counts.items())
+
+
+def _lines(lines: list[str]) -> None:
+    for line in lines[:SHOWN]:
+        console().print(line, style="red", markup=False, soft_wrap=True)
+    if len(lines) > SHOWN:
+        console().print(f"and {len(lines) - SHOWN} more (--json names all)", style="red", markup=False)
+
+
+@contextmanager
+def _steps(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*parts, console=console(stderr=True), disable=quiet, transient=True) as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
