@@ -48,4 +48,5 @@ def check_store(location: str | os.PathLike[str], step: Step | None = None) -> V
 
 
 def _short(text: str) -> str:
+    text = " ".join(text.split())
     return text if len(text) <= 300 else text[:297] + "..."

@@ -41,8 +41,8 @@ class Database(Protocol):
         """Make an empty store where there is nothing yet, and bring an old one to this schema. Raises StoreError."""
         ...
 
-    def find(self) -> None:
-        """Raise StoreError when there is nothing to open; what is there need not be whole."""
+    def connect_damaged(self) -> Engine:
+        """An engine that reads what it can of a store that may be damaged. Raises StoreError when there is nothing at all."""
         ...
 
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:

@@ -72,8 +72,9 @@ class PostgresServer:
                 " open it with the program that wrote it"
             )
 
-    def find(self) -> None:
-        """Nothing: whoever asks the server hears it."""
+    def connect_damaged(self) -> Engine:
+        """The same as for a whole one: what is unreadable is an error of the server for that row."""
+        return self.connect(read_only=True, busy_timeout_s=0.0)
 
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
         """An engine on the server; a transaction with the execution option ``writing`` waits for the one before to end."""

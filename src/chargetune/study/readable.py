@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 from sqlalchemy import ColumnElement, Engine, Row, Table, func, inspect, literal_column, select
@@ -24,6 +25,8 @@ __all__ = ["Content", "Finding", "Key", "Step", "columns", "opened", "read_conte
 Key = tuple[int, int]
 # Receives the rows read so far and how many there are in all.
 Step = Callable[[int, int], None]
+# Where even the number of the last row is lost, reading ends after so many numbers without a row.
+STRAY = 5000
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,7 @@ class Content:
 @contextmanager
 def opened(database: Database) -> Iterator[Engine]:
     """An engine on a store of this schema, damaged or not. Raises StoreError for what is no such store."""
-    database.find()
-    engine = database.connect(read_only=True, busy_timeout_s=10.0)
+    engine = database.connect_damaged()
     try:
         try:
             with engine.connect() as connection:
@@ -128,31 +130,38 @@ def read_traces(database: Database, engine: Engine, content: Content, step: Step
 
 
 def _rows(database: Database, engine: Engine, table: Table, findings: list[Finding]) -> Iterator[Row[Any]]:
-    """Each row by its key. A row that cannot be read, and a table that says not even what it has, goes to ``findings``."""
+    """Each row by its key. What cannot be read goes to ``findings``, as one for the table."""
+    lost, why = 0, ""
     # SQLite finds a row by its number without the index, and a number without a row costs microseconds.
-    key: list[ColumnElement[Any]] = [literal_column("rowid")] if isinstance(database, SqliteFile) else list(table.primary_key)
+    by_number = isinstance(database, SqliteFile)
+    key: list[ColumnElement[Any]] = [literal_column("rowid")] if by_number else list(table.primary_key)
+    last: int | None = None
+    keys: Iterable[tuple[Any, ...]] = ()
     try:
         with engine.connect() as connection:
-            if isinstance(database, SqliteFile):
+            if by_number:
                 last = connection.execute(select(func.max(key[0])).select_from(table)).scalar() or 0
-                keys: list[tuple[Any, ...]] = [(number,) for number in range(1, last + 1)]
             else:
                 keys = [tuple(row) for row in connection.execute(select(*key).order_by(*key))]
     except DBAPIError as error:
-        findings.append(Finding(None, None, f"the table of each {table.name} cannot be read ({error.orig})"))
-        return
-    lost, why = 0, ""
+        lost, why = 1, str(error.orig)
+    if by_number:
+        keys = ((number,) for number in (count(1) if last is None else range(1, last + 1)))
+    misses = 0
     for values in keys:
         try:
             with engine.connect() as connection:
                 row = connection.execute(select(table).where(*(c == v for c, v in zip(key, values, strict=True)))).first()
         except (DBAPIError, ValueError) as error:  # ValueError: text that is no UTF-8
-            lost, why = lost + 1, str(getattr(error, "orig", error))
-            continue
+            row, lost, why = None, lost + 1, str(getattr(error, "orig", error))
+        misses = 0 if row is not None else misses + 1
         if row is not None:
             yield row
+        elif last is None and misses == STRAY:
+            break
     if lost:
-        findings.append(Finding(None, None, f"{lost} of at most {len(keys)} rows of the table {table.name} cannot be read ({why})"))
+        many = "rows" if last is None else f"{lost} of at most {last} rows"
+        findings.append(Finding(None, None, f"{many} of the table {table.name} cannot be read ({why})"))
 
 
 def _study_fault(row: Row[Any]) -> str:

@@ -21,8 +21,11 @@ from chargetune.study.records import StoreError
 
 __all__ = ["SqliteFile"]
 
+SALVAGE = "; `chargetune store salvage` saves what can be read into a new file"
 # A file system may give two writes within some milliseconds the same time: a change younger than this may hide another.
 SETTLED_S = 1.0
+# How long reading a damaged file waits for a writer.
+PATIENCE_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -59,9 +62,10 @@ class SqliteFile:
         except OSError as error:
             raise StoreError(f"{self.path}: cannot be opened or created ({error.strerror})") from error
 
-    def find(self) -> None:
-        """StoreError unless there is a file."""
+    def connect_damaged(self) -> Engine:
+        """An engine that only reads, and opens a file that was cut off, too."""
         _is_there(self.path, read_only=True)
+        return connect_engine(self.path, read_only=True, busy_timeout_s=PATIENCE_S, damaged=True)
 
     def connect(self, *, read_only: bool, busy_timeout_s: float) -> Engine:
         """An engine on the file; a transaction with the execution option ``writing`` takes the write lock when it begins."""
@@ -121,9 +125,7 @@ class SqliteFile:
             )
         damage = self.damage(connection)
         if damage:
-            raise StoreError(
-                f"{self.path}: damaged, nothing was changed ({damage}); `chargetune store salvage` saves what can be read into a new file"
-            )
+            raise StoreError(f"{self.path}: damaged, nothing was changed ({' '.join(damage.split())}){SALVAGE}")
         if version < schema.SCHEMA_VERSION and read_only:
             raise StoreError(
                 f"{self.path}: schema version {version}, this program reads version {schema.SCHEMA_VERSION};"
@@ -173,7 +175,7 @@ def _create(path: Path) -> None:
         aside.unlink(missing_ok=True)
 
 
-def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: str = "rw") -> Engine:
+def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: str = "rw", damaged: bool = False) -> Engine:
     """An engine on the file; ``execution_options(writing=True)`` takes the write lock at the beginning of a transaction."""
     query = "mode=ro" if read_only else f"mode={mode}"
     writable = os.access(path.parent, os.W_OK, effective_ids=os.access in os.supports_effective_ids)
@@ -190,6 +192,9 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
 
     @event.listens_for(engine, "connect")
     def configure(connection: Any, _record: object) -> None:
+        if damaged:
+            # Otherwise a file shorter than its header says is refused as a whole.
+            connection.execute("PRAGMA writable_schema=ON")
         connection.execute("PRAGMA foreign_keys=ON")
         connection.execute("PRAGMA synchronous=FULL")
 
@@ -215,4 +220,5 @@ def explain(path: Path, error: DBAPIError) -> str:
         sqlite3.SQLITE_FULL: "the disk is full, nothing of this transaction was stored",
         sqlite3.SQLITE_IOERR: "reading or writing failed on the disk",
     }
-    return f"{path}: {meanings[code]} ({reason})" if code in meanings else f"{path}: {reason}"
+    remedy = SALVAGE if code == sqlite3.SQLITE_CORRUPT else ""
+    return f"{path}: {meanings[code]} ({reason}){remedy}" if code in meanings else f"{path}: {reason}"
