@@ -143,6 +143,6 @@ def _bare(name: str, unit: str) -> str:
 
 def _folder_name(record: StudyRecord, records: list[StudyRecord]) -> str:
     # Names of studies may have characters that a file system refuses, and differ in case alone.
-    names = {r.id: re.sub(r"[^\w.,+=@()-]+", "_", r.name).strip(".") for r in records}
+    names = {r.id: re.sub(r"[^\w .,+=@()-]+", "_", r.name).strip(" .") for r in records}
     alike = [r for r in records if names[r.id].lower() == names[record.id].lower()]
     return names[record.id] if len(alike) == 1 else f"{names[record.id]}-{record.id}"
