@@ -31,7 +31,7 @@ def cut_all(url, who="chargetune"):
 
 
 # Before which statement of the transaction the connection breaks.
-@pytest.mark.parametrize("statement", ["SELECT pg_advisory", "INSERT INTO chargetune.trace", "UPDATE chargetune.trial"])
+@pytest.mark.parametrize("statement", ["SET LOCAL", "INSERT INTO chargetune.trace", "UPDATE chargetune.trial"])
 def test_a_result_is_told_although_the_connection_breaks(postgres, statement):
     cuts = []
 

@@ -87,10 +87,9 @@ class PostgresServer:
             if read_only:
                 connection.exec_driver_sql("SET TRANSACTION READ ONLY")
             elif connection.get_execution_options().get("writing"):
-                connection.exec_driver_sql(f"SET LOCAL lock_timeout = {timeout_ms}")
-                # Durable when it is told, whatever the server is set to.
-                connection.exec_driver_sql("SET LOCAL synchronous_commit = on")
-                connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCKS}, 0)")
+                # One message to the server. The commit is durable when it is told, whatever the server is set to.
+                settings = f"SET LOCAL lock_timeout = {timeout_ms}; SET LOCAL synchronous_commit = on"
+                connection.exec_driver_sql(f"{settings}; SELECT pg_advisory_xact_lock({LOCKS}, 0)")
 
         return engine
 

@@ -161,18 +161,20 @@ class Store:
         own = (schema.trial.c.study_id == study_id, schema.trial.c.number >= 0)
 
         def add(connection: Connection) -> None:
-            stored = connection.execute(select(schema.trial).where(*own).order_by(schema.trial.c.number)).all()
-            numbers = [trial.number for trial in trials]
-            if stored and stored[-1].number >= len(stored):
+            count, last = connection.execute(select(func.count(), func.max(schema.trial.c.number)).where(*own)).one()
+            if count and last >= count:
                 raise StoreError(
                     f"{self.label}: this study lacks trials since it was salvaged, and cannot go on;"
                     " a new study can begin with what it has ([[study.earlier]])"
                 )
-            if numbers == list(range(len(stored), len(stored) + len(trials))):
+            numbers = [trial.number for trial in trials]
+            if numbers == list(range(count, count + len(trials))):
                 connection.execute(insert(schema.trial), rows)
-            elif [trial_of(row) for row in stored[-len(trials) :]] != list(trials):
-                # Equal ones are this very transaction, whose answer was lost.
-                raise StoreError(f"{self.label}: trial numbers {numbers} do not follow the {len(stored)} stored ones")
+                return
+            newest = select(schema.trial).where(*own, schema.trial.c.number >= count - len(trials)).order_by(schema.trial.c.number)
+            # Equal ones are this very transaction, whose answer was lost.
+            if [trial_of(row) for row in connection.execute(newest)] != list(trials):
+                raise StoreError(f"{self.label}: trial numbers {numbers} do not follow the {count} stored ones")
 
         self.write(add, study_id, term)
 
