@@ -1,5 +1,6 @@
 """What a store promises, on every kind of database below it."""
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -206,6 +207,22 @@ class TestContract:
         with Store(tmp_path / "whole.db") as store, open_study(store, batch=2) as study:
             study.run(Toy(), 9)
             assert essence(study.trials()) == found
+
+    def test_a_wall_clock_that_jumps_changes_nothing(self, opened, tmp_path, monkeypatch):
+        jumps = itertools.cycle(["2031-01-01T00:00:00.000+00:00", "1999-12-31T23:59:59.999+00:00", "2026-06-01T12:00:00.000+00:00"])
+        for module in ("store", "study"):
+            monkeypatch.setattr(f"chargetune.study.{module}.utc_now", lambda: next(jumps))
+        for trials in (3, 7):
+            with open_study(opened, batch=2) as study:
+                study.run(Toy(), trials)
+        found = opened.trials(1)
+        monkeypatch.undo()
+        assert any(t.told_at < t.asked_at for t in found)
+        with Store(tmp_path / "whole.db") as store, open_study(store, batch=2) as study:
+            study.run(Toy(), 7)
+            assert essence(study.trials()) == essence(found)
+        with pytest.raises(StoreError, match="is done already, with another result"):
+            finish(opened, 1, 0)
 
     def test_two_thousand_trials_list_fast(self, opened):
         study = opened.add_study("a", {}).id

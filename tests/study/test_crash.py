@@ -14,9 +14,11 @@ import pytest
 from sqlalchemy import Engine, event
 from study_toy import Toy, essence, open_study
 
+from chargetune.study.check import check_store
 from chargetune.study.executors import process_executor
 from chargetune.study.lease import take_lease
 from chargetune.study.store import Store
+from chargetune.study.study import StudyError
 
 # A fork starts in a millisecond, so that the kills fall into the work and not into the imports.
 FORK = multiprocessing.get_context("fork")
@@ -77,33 +79,73 @@ def test_twenty_kills_at_random_moments(tmp_path, batch, workers):
         assert [study.trace(t.number) is not None for t in study.trials()] == [e[6] is not None for e in wanted]
 
 
-def die_before(path, statement):
+def die_before(path, statement, hardware):
     @event.listens_for(Engine, "before_cursor_execute")
     def listen(_connection, _cursor, sql, *_):
         if sql.startswith(statement):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    with Store(path) as store, open_study(store) as study:
+    with Store(path) as store, open_study(store, hardware=hardware) as study:
         study.run(Toy(), 3)
 
 
-@pytest.mark.parametrize(
-    ("statement", "studies", "running", "traces"),
-    [("CREATE TABLE", None, 0, 0), ("INSERT INTO trial", 1, 0, 0), ("INSERT INTO trace", 1, 1, 0), ("UPDATE trial", 1, 1, 0)],
-)
-def test_kill_inside_a_transaction(tmp_path, statement, studies, running, traces):
+# Where a process dies -> studies, running trials, and whether the trial may have begun.
+MOMENTS = {
+    "\nCREATE TABLE": (None, 0, 0),
+    "INSERT INTO trial": (1, 0, 0),
+    "UPDATE trial SET attempt": (1, 1, 0),  # between ask and start
+    "INSERT INTO trace": (1, 1, 1),
+    "UPDATE trial SET number": (1, 1, 1),  # the result, after its trace
+}
+
+
+@pytest.mark.parametrize("hardware", [False, True])
+@pytest.mark.parametrize("statement", MOMENTS)
+def test_kill_inside_a_transaction(tmp_path, statement, hardware):
+    studies, running, begun = MOMENTS[statement]
     path = tmp_path / "s.db"
-    process = FORK.Process(target=die_before, args=(path, statement.replace("CREATE TABLE", "\nCREATE TABLE")))
+    process = FORK.Process(target=die_before, args=(path, statement, hardware))
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
     assert path.exists() == (studies is not None)
-    with Store(path) as store, open_study(store) as study:
-        assert [t.status for t in study.trials()] == ["running"] * running
+    with Store(path) as store, open_study(store, hardware=hardware) as study:
+        assert [(t.status, t.attempt) for t in study.trials()] == [("running", begun)] * running
         with store._engine.connect() as connection:
-            assert connection.exec_driver_sql("SELECT count(*) FROM trace").scalar() == traces
+            assert connection.exec_driver_sql("SELECT count(*) FROM trace").scalar() == 0
+        if hardware and begun:
+            with pytest.raises(StudyError, match=r"trials \[0\] were begun"):
+                study.run(Toy(), 3)
+            study.fail(0, "the operator: was not charged")
         study.run(Toy(), 3)
         assert [t.number for t in study.trials()] == [0, 1, 2]
+        assert [t.attempt for t in study.trials()] == [1 if hardware else 1 + begun, 1, 1]
+
+
+def test_a_log_that_ends_anywhere_holds_trace_and_result_or_neither(tmp_path):
+    """As after a loss of power: of the last transaction any part may have reached the disk."""
+    path, wal = tmp_path / "s.db", tmp_path / "s.db-wal"
+    with Store(path) as store, open_study(store) as study:
+        (trial,) = study.hand_out(study.ask())
+        before = wal.stat().st_size
+        score, episode, ending = Toy()(trial.theta, trial.seed)
+        study.tell(0, score, episode, ending=ending)
+        after = wal.stat().st_size
+        main, log = path.read_bytes(), wal.read_bytes()
+    assert after > before + 4096
+    found = []
+    for k, length in enumerate([*np.linspace(before, after, 40).astype(int).tolist(), after - 1, after]):
+        cut = tmp_path / f"{k}.db"
+        cut.write_bytes(main)
+        cut.with_name(cut.name + "-wal").write_bytes(log[:length])
+        with Store(cut) as store:
+            (stored,) = store.trials(1)
+            trace = store.trace(1, 0)
+            assert (stored.status == "done") == (trace is not None)
+            assert check_store(cut).findings == ()
+            found.append(str(stored.status))
+    assert found[0] == found[-2] == "running"
+    assert found[-1] == "done"
 
 
 def try_lease(path, connection):

@@ -197,6 +197,8 @@ def test_reading_needs_no_right_to_write(postgres):
                 assert len(reader.trials(1)) == 2
             with Store(url) as writer, pytest.raises(StoreError, match="no permission for this"):
                 writer.add_study("b", {})
+            with Store(url) as writer, pytest.raises(StoreError, match="no permission for this"):
+                open_study(writer)
         finally:
             connection.execute(f"DROP OWNED BY {name}")
             connection.execute(f"DROP ROLE {name}")

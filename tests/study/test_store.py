@@ -1,16 +1,22 @@
+import multiprocessing
 import os
+import resource
 import shutil
+import signal
 import sqlite3
 import tempfile
 import time
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import event
 from study_toy import CONFIG, SPACE, Halfway, Toy, essence, open_study
 
 from chargetune.episode.score import Score
+from chargetune.study.check import check_store
 from chargetune.study.store import Store, StoreError
 from chargetune.study.trace import encode
 from chargetune.study.trial import Trial
@@ -68,20 +74,94 @@ def test_trace_and_result_are_stored_both_or_neither(store, when):
     assert store.trace(study, 0) is not None
 
 
-def test_full_disk_loses_nothing_and_the_result_can_be_told_again(store):
+def room(store, pages):
+    """Leave the file so many pages to grow, as a disk would."""
+    with store._engine.connect() as connection:
+        used = connection.exec_driver_sql("PRAGMA page_count").scalar()
+        connection.exec_driver_sql(f"PRAGMA max_page_count={used + pages}")
+
+
+BIG = encode({"v": np.random.default_rng(0).random(200_000)}, {})
+
+
+def test_full_disk_loses_nothing_and_the_result_can_be_told_again(tmp_path):
+    with Store(tmp_path / "s.db", busy_timeout_s=0.3) as store:
+        study = a_study(store)
+        finish(store, study, 0)
+        room(store, 10)
+        start = time.monotonic()
+        with pytest.raises(StoreError, match="the disk is full"):
+            finish(store, study, 1, trace=BIG)
+        assert 0.2 < time.monotonic() - start < 5
+        assert [t.status for t in store.trials(study)] == ["done", "running"]
+        assert check_store(store.location).findings == ()
+        room(store, 10_000)
+        finish(store, study, 1, trace=BIG)
+        assert store.trace(study, 1)[0]["v"].size == 200_000
+
+
+def test_a_result_waits_for_room_on_the_disk(store):
     study = a_study(store)
-    finish(store, study, 0)
-    big = encode({"v": np.random.default_rng(0).random(200_000)}, {})
-    with store._engine.connect() as connection:
-        pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
-        connection.exec_driver_sql(f"PRAGMA max_page_count={pages + 10}")
-    with pytest.raises(StoreError, match="the disk is full"):
-        finish(store, study, 1, trace=big)
-    assert [t.status for t in store.trials(study)] == ["done", "running"]
-    with store._engine.connect() as connection:
-        connection.exec_driver_sql("PRAGMA max_page_count=1000000")
-    finish(store, study, 1, trace=big)
-    assert store.trace(study, 1)[0]["v"].size == 200_000
+    room(store, 10)
+    starts = []
+
+    @event.listens_for(store._engine, "begin")
+    def make_room(connection):
+        starts.append(time.monotonic())
+        if len(starts) == 3:
+            connection.exec_driver_sql("PRAGMA max_page_count=100000")
+
+    assert finish(store, study, 0, trace=BIG).status == "done"
+    assert len(starts) == 3
+    assert store.trace(study, 0)[0]["v"].size == 200_000
+
+
+def fill_up(path, connection):
+    """Write until the system refuses: no byte of this process beyond 400 kB of a file."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
+    runs = []
+
+    def evaluate(theta, seed):
+        runs.append(seed)
+        return SCORE, Noise(seed), "done"
+
+    with Store(path, busy_timeout_s=0.0) as store, open_study(store) as study:
+        try:
+            study.run(evaluate, 1000)
+        except StoreError as error:
+            connection.send((len(runs), str(error)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    seed: int
+
+    def arrays(self):
+        return {"v": np.random.default_rng(self.seed).random(2000)}
+
+    def meta(self):
+        return {}
+
+
+def test_when_the_system_writes_no_more_the_study_stops_and_goes_on_later(tmp_path):
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe()
+    process = fork.Process(target=fill_up, args=(tmp_path / "s.db", there))
+    process.start()
+    assert here.poll(30)
+    runs, message = here.recv()
+    process.join()
+    assert process.exitcode == 0
+    assert "full" in message or "reading or writing failed on the disk" in message
+    with Store(tmp_path / "s.db") as store, open_study(store) as study:
+        told = [t for t in study.trials() if t.status == "done"]
+        # The last one was evaluated and could not be told, or not even be begun.
+        assert len(told) in {runs - 1, runs}
+        assert len(told) > 5
+        assert check_store(store.location).findings == ()
+        study.run(lambda theta, seed: (SCORE, Noise(seed), "done"), len(told) + 3)
+        assert {t.status for t in study.trials()} == {"done"}
 
 
 def a_filled_file(path):

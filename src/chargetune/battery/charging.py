@@ -379,8 +379,13 @@ class ChargingProblem:
         return float(1e3 * episode.sampling_time_s * np.sum(beyond))
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:
-        """Evaluate theta: (score, episode, ending); no score when the episode did not come to its end."""
+        """Evaluate theta: (score, episode, ending); no score when the episode did not come to its end.
+
+        Raises KeyboardInterrupt when that is what ended it: a simulation says nothing about theta then, and can be run again.
+        """
         episode = self.episode(theta, seed)
+        if episode.ending is Ending.INTERRUPTED:
+            raise KeyboardInterrupt(episode.message)
         if episode.ending is not Ending.DONE:
             return None, episode, f"{episode.ending.value}: {episode.message}"
         try:

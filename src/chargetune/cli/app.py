@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -21,10 +23,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-
 store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
+INTERRUPTED = 130
 
 
 class ExportFormat(StrEnum):
@@ -336,11 +337,16 @@ def _options(
 
 def main() -> None:
     """Run the command line; an error a person can mend is one message and exit code 2."""
+    # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
-    except KeyboardInterrupt:
-        typer.echo("interrupted; the same command resumes", err=True)
-        sys.exit(130)
+    except SystemExit as ended:
+        # That is what typer makes of KeyboardInterrupt, without a word.
+        if ended.code == INTERRUPTED:
+            typer.echo("interrupted; the same command resumes", err=True)
+        raise
     except (ValueError, OSError) as error:
         _refuse(error)
     except Exception as error:

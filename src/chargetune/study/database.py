@@ -57,8 +57,8 @@ class Database(Protocol):
         """What a database error means for a person."""
         ...
 
-    def lost(self, error: DBAPIError) -> bool:
-        """Whether the connection broke, so that the transaction may or may not have been stored."""
+    def passes(self, error: DBAPIError) -> bool:
+        """Whether the same transaction may succeed a moment later: the connection broke, or the disk is full."""
         ...
 
     def mark(self) -> tuple[object, bool]:

@@ -23,11 +23,12 @@ SCHEMA = "chargetune"
 # Advisory locks of this program: (LOCKS, 0) while a transaction writes, (LOCKS, study id) while a process holds a study.
 LOCKS = 0x63747573
 CONNECT_S = 10
+DISK_FULL = "53100"
 MEANINGS = {
     "55P03": "is locked by another session that did not let go in time",
     "42501": "no permission for this",
     "25006": "opened read-only",
-    "53100": "the server's disk is full, nothing of this transaction was stored",
+    DISK_FULL: "the server's disk is full, nothing of this transaction was stored",
     "XX001": "the server reports damaged data, nothing was changed",
     "XX002": "the server reports a damaged index, nothing was changed",
 }
@@ -104,6 +105,10 @@ class PostgresServer:
         if state in MEANINGS:
             return f"{self.label}: {MEANINGS[state]} ({reason})"
         return f"{self.label}: {'no connection to the server' if self.lost(error) else 'refused'} ({reason})"
+
+    def passes(self, error: DBAPIError) -> bool:
+        """Whether the connection broke, so that the transaction may or may not have been stored, or the server's disk is full."""
+        return self.lost(error) or getattr(error.orig, "sqlstate", None) == DISK_FULL
 
     def lost(self, error: DBAPIError) -> bool:
         """Whether the connection broke or could not be made: no SQLSTATE, or one of class 08 or 57P (server going down)."""

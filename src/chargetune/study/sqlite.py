@@ -87,9 +87,9 @@ class SqliteFile:
         """What a database error means for the person at the keyboard."""
         return explain(self.path, error)
 
-    def lost(self, error: DBAPIError) -> bool:
-        """Never: there is no connection to lose."""
-        return False
+    def passes(self, error: DBAPIError) -> bool:
+        """Whether the disk is full: somebody may make room."""
+        return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_FULL
 
     def mark(self) -> tuple[object, bool]:
         """Identity, size and time of the file and of its log, and whether the newest of them has some age."""

@@ -35,7 +35,7 @@ class Store:
     location
         The path of an SQLite file, or ``postgresql://user@host/database``.
     busy_timeout_s
-        How long a writer waits for another one, and how long a lost connection to a server is tried again.
+        How long a writer waits for another one, and how long a lost connection or a full disk is tried again.
 
     Every change is one transaction, on the disk when the method returns. With ``read_only`` nothing is created or changed.
     A store of an older schema is brought to this one, after a copy of the file was made.
@@ -323,7 +323,7 @@ class Store:
         return self._persist(once)
 
     def write(self, action: Callable[[Connection], T], study_id: int | None = None, term: int | None = None) -> T:
-        """Run ``action`` as one transaction; more than once when a connection is lost, so it must bear repetition."""
+        """Run ``action`` as one transaction; again when a connection is lost or the disk is full, so it must bear repetition."""
         if self.read_only:
             raise StoreError(f"{self.label}: opened read-only")
 
@@ -348,7 +348,7 @@ class Store:
             except IntegrityError as error:
                 raise StoreError(f"{self.label}: refused by the store ({error.orig})") from error
             except DBAPIError as error:
-                if self.database.lost(error) and time.monotonic() < until:
+                if self.database.passes(error) and time.monotonic() < until:
                     time.sleep(PAUSE_S)
                     continue
                 message = self.database.explain(error)

@@ -1,0 +1,77 @@
+"""SIGINT and SIGTERM: the command stops in order, nothing counts as failed, and the same command resumes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from chargetune.battery.cell import load_cell
+from chargetune.battery.charging import Backoff, ChargingProblem
+from chargetune.battery.electrochemical import Electrochemical
+from chargetune.learning import Sobol
+from chargetune.study.store import Store, StoreError
+from chargetune.study.study import Study
+
+CONFIG = """
+[study]
+name = "stopped"
+tuner = "sobol"
+trials = 100000
+[theta.backoff]
+nodes = 3
+lower_V = 0.0
+upper_V = 0.2
+"""
+
+
+def told(path):
+    try:
+        with Store(path, read_only=True) as store:
+            return sum(t.status == "done" for r in store.studies() for t in store.trials(r.id))
+    except StoreError:
+        return 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_stops_and_resumes(tmp_path, number):
+    (tmp_path / "s.toml").write_text(CONFIG)
+    command = [sys.executable, "-m", "chargetune", "tune", str(tmp_path / "s.toml"), "--store", str(tmp_path / "s.db")]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 60
+    while told(tmp_path / "s.db") < 3:
+        assert process.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted; the same command resumes" in err
+    with Store(tmp_path / "s.db") as store:
+        trials = store.trials(1)
+    assert {t.status for t in trials} <= {"done", "running"}
+    again = subprocess.run([*command, "--trials", str(len(trials) + 1), "--json"], capture_output=True, text=True, check=True)
+    found = json.loads(again.stdout)
+    assert (found["trials"], found["failed"]) == (len(trials) + 1, 0)
+
+
+def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path):
+    okane = load_cell(Path(__file__).parents[2] / "examples" / "okane2022.toml")
+    problem = ChargingProblem(okane, mismatch_seed=None, plant_model=Electrochemical(model="SPM"), backoff=Backoff(3), current_max_A=10.0)
+    problem(problem.space.default, 0)
+    with Store(tmp_path / "s.db") as store, Study.create_or_resume(store, "s", config={}, space=problem.space, tuner=Sobol()) as study:
+        timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            study.run(problem, 1000)
+        timer.join()
+        trials = study.trials()
+        assert trials[-1].status == "running"
+        assert {t.status for t in trials[:-1]} <= {"done"}
+        study.run(problem, len(trials))
+        assert {t.status for t in study.trials()} == {"done"}
