@@ -68,7 +68,7 @@ def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path
         timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
         timer.start()
         with pytest.raises(KeyboardInterrupt):
-            study.run(problem, 1000)
+            study.run(problem, 40)
         timer.join()
         trials = study.trials()
         assert trials[-1].status == "running"
