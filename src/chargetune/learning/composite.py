@@ -32,7 +32,7 @@ __all__ = ["Composite", "CompositeLoop", "Passage"]
 # Side of the box about theta_0, in the unit cube, that the first points are spread over.
 DESIGN = 0.6
 # Standard deviations added to an excess by the cautious proposals, and taken off it by those that explore.
-CAUTION, OPTIMISM = 0.5, 1.0
+CAUTION, OPTIMISM = 1.0, 1.0
 # Of a limit's tolerance, what a proposal may use. The rest is left to noise, whose largest value in a window counts.
 AIMED = 0.0
 # A per cent of the objective weighs as much as this excess beyond the tolerance, in tolerances, in one window.
@@ -44,8 +44,6 @@ JITTER = 1e-6
 REACH = 1.0
 # Rates below this share of what passes a window in a whole episode are smoothly replaced by it.
 SLOWEST = 0.7
-# A trial is called the best when its excess is believed to be at most so many tolerances beyond its tolerance.
-KEPT = 0.0
 
 
 @dataclass(frozen=True)
@@ -224,16 +222,22 @@ class _Belief:
         self.excesses = _Processes(data.x, data.excess[:, self.near], spread)
         with torch.no_grad():
             objective = self.objective(self.rates(self.x)[0])
-            mean, _ = self.excesses(self.x)
-            worst = ((mean - self.tolerances) / self.units).amax(1) if mean.shape[1] else torch.full_like(objective, -torch.inf)
-        kept = worst <= KEPT
-        self.incumbent = int((torch.where(kept, objective, -torch.inf) if kept.any() else -worst).argmax())
-        self.scale = float(objective.abs().median()) or 1.0
+            self.scale = float(objective.abs().median()) or 1.0
+            self.incumbent = int(self.merit(self.x, CAUTION, 0.0).argmax())
 
     def objective(self, rate: torch.Tensor) -> torch.Tensor:
         """g of rates (..., w); smooth and finite where a rate is none."""
         rate = self._least * (torch.nn.functional.softplus(rate / self._least) + 1e-2)
         return -(self._costs * self._widths / rate).sum(-1)
+
+
+    def merit(self, x: torch.Tensor, caution: float, optimism: float) -> torch.Tensor:
+        """g(rate + optimism sd) in per cent, less the squared excess of mean + caution sd, in tolerances; x (b, d) -> (b,)."""
+        mean, sd = self.rates(x)
+        excess, deviation = self.excesses(x)
+        over = (excess + caution * deviation - AIMED * self.tolerances).clamp_min(0.0) / self.units
+        value: torch.Tensor = 100.0 / self.scale * self.objective(mean + optimism * sd) - (over / STIFFNESS).square().sum(-1)
+        return value
 
 
 class _Processes:
@@ -302,7 +306,7 @@ def _near(excess: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class _Merit(AcquisitionFunction):
-    """g(rate + optimism sd), in per cent, less the squared excess of mean + caution sd, in tolerances; see `Composite`."""
+    """`_Belief.merit` as BoTorch asks for it."""
 
     def __init__(self, belief: _Belief, caution: float, optimism: float) -> None:
         super().__init__(model=belief.rates._model)
@@ -311,10 +315,4 @@ class _Merit(AcquisitionFunction):
     @t_batch_mode_transform(expected_q=1, assert_output_shape=False)  # type: ignore[arg-type] # it types self as the base class
     def forward(self, X: torch.Tensor) -> torch.Tensor:
         """X (b, 1, d) -> (b,)."""
-        belief, x = self._belief, X[:, 0]
-        mean, sd = belief.rates(x)
-        objective = 100.0 / belief.scale * belief.objective(mean + self._optimism * sd)
-        excess, deviation = belief.excesses(x)
-        over = (excess + self._caution * deviation - AIMED * belief.tolerances).clamp_min(0.0) / belief.units
-        value: torch.Tensor = objective - (over / STIFFNESS).square().sum(-1)
-        return value
+        return self._belief.merit(X[:, 0], self._caution, self._optimism)
