@@ -213,9 +213,9 @@ class _Belief:
         each = np.repeat(loop.tolerances, len(loop.widths))[self.near]
         spread = data.spread[:, self.near]
         self.tolerances = torch.as_tensor(each)
-        # A limit that allows nothing at all still needs a unit: the noise.
+        # What noise can make of an excess is not worth a large step back.
         noise = np.array([np.median(column[np.isfinite(column)]) for column in spread.T])
-        self.units = torch.as_tensor(np.where(each > 0, each, np.maximum(noise, 1e-12)))
+        self.units = torch.as_tensor(np.maximum(np.hypot(each, noise), 1e-12))
         self._widths, self._costs = torch.as_tensor(loop.widths), torch.as_tensor(loop.costs)
         self._least = SLOWEST * self._widths / loop.duration_s
         self.rates = _Processes(data.x, data.rate, np.zeros_like(data.rate))
