@@ -111,7 +111,7 @@ def smoothed(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Both ends (K, 2) of a noisy output regressed locally, and the factors by which its noise shrinks, (K, 2).
 
-    At each interval on 1, t, t^2 and the current, which is known without noise: so its kinks and jumps stay sharp in the output.
+    At each interval on 1, t, t^2, t^3 and the current, which is known without noise: so its kinks and jumps stay sharp in the output.
     """
     count = len(current)
     n = min(2 * MOST + 1, count)
@@ -124,7 +124,7 @@ def smoothed(
     current = current / (np.abs(current).max() or 1.0)
 
     def features(t: NDArray[np.float64], i: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([np.ones_like(t), t, t**2, i], axis=-1)
+        return np.stack([np.ones_like(t), t, t**2, t**3, i], axis=-1)
 
     values = np.concatenate([ends[index, 0], ends[index, 1]], axis=1)
     weight = np.concatenate([close, close], axis=1) & np.isfinite(values)
@@ -136,7 +136,7 @@ def smoothed(
     weighted = rows * weight[..., None]
     normal = np.swapaxes(weighted, 1, 2) @ rows
     # Where the current is constant its coefficient has no meaning and is 0.
-    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(4) + 1e-12 * np.eye(4)
+    normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(5) + 1e-12 * np.eye(5)
     hat = at @ np.linalg.solve(normal, np.swapaxes(weighted, 1, 2))
     out = np.einsum("kij,kj->ki", hat, np.nan_to_num(values))
     return np.where(np.isfinite(ends), out, np.nan), np.asarray(np.sqrt((hat**2).sum(axis=-1)))

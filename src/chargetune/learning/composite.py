@@ -34,7 +34,7 @@ DESIGN = 0.6
 # Standard deviations added to an excess by the cautious proposals, and taken off it by those that explore.
 CAUTION, OPTIMISM = 1.0, 1.0
 # Of a limit's tolerance, what a proposal may use. The rest is left to noise, whose largest value in a window counts.
-AIMED = 0.0
+AIMED = 0.5
 # A per cent of the objective weighs as much as this excess beyond the tolerance, in tolerances, in one window.
 STIFFNESS = 0.5
 # An output that was not measured is told with this variance, so that all are fitted in one go. Outputs are scaled to about one.
