@@ -13,6 +13,6 @@ from chargetune.learning.twin import Twin, Uncertain
 from chargetune.learning.twin_tuner import TwinTuner
 
 __all__ = [
-    "Composite", "ConstrainedLogEI", "Envelope", "ExpectedImprovement", "GaussianProcess", "NoSafeThetaError", "Posterior", "Safety", "Sobol",
-    "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
+    "Composite", "ConstrainedLogEI", "Envelope", "ExpectedImprovement", "GaussianProcess", "NoSafeThetaError", "Posterior", "Safety",
+    "Sobol", "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
 ]  # fmt: skip

@@ -105,6 +105,10 @@ class Composite:
     seed: int = 0
     n_initial: int = 8
 
+    def __post_init__(self) -> None:
+        if isinstance(self.n_initial, bool) or not isinstance(self.n_initial, int) or self.n_initial < 0:
+            raise ValueError(f"composite: n_initial = {self.n_initial!r}, allowed is an integer >= 0")
+
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
         """The next ``n`` thetas, shape (n, d)."""
         check_count(n)
@@ -230,7 +234,6 @@ class _Belief:
         rate = self._least * (torch.nn.functional.softplus(rate / self._least) + 1e-2)
         return -(self._costs * self._widths / rate).sum(-1)
 
-
     def merit(self, x: torch.Tensor, caution: float, optimism: float) -> torch.Tensor:
         """g(rate + optimism sd) in per cent, less the squared excess of mean + caution sd, in tolerances; x (b, d) -> (b,)."""
         mean, sd = self.rates(x)
@@ -244,9 +247,8 @@ class _Processes:
     """m independent processes on the same points, mean and sd (b, m) at points (b, d)."""
 
     def __init__(self, x: NDArray[np.float64], y: NDArray[np.float64], spread: NDArray[np.float64]) -> None:
-        n, m = y.shape
-        self._count = m
-        if not m:
+        self._count = y.shape[1]
+        if not self._count:
             return
         known = np.isfinite(y)
         count = np.maximum(known.sum(0), 1)
@@ -258,14 +260,14 @@ class _Processes:
         self._mean, self._scale = torch.as_tensor(mean), torch.as_tensor(scale)
         scaled = torch.as_tensor(np.where(known, (y - mean) / scale, 0.0))
         variance = torch.as_tensor(np.where(known, (np.nan_to_num(spread) / scale) ** 2 + JITTER, UNKNOWN))
-        self._model = _fitted(torch.as_tensor(x), scaled, variance)
+        self.model = _fitted(torch.as_tensor(x), scaled, variance)
 
     def __call__(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         if not self._count:
             return x.new_empty(len(x), 0), x.new_empty(len(x), 0)
         # The processes are asked at points they were fitted to as well.
-        with gpytorch.settings.debug(False):
-            found: Any = self._model(x.expand(self._count, *x.shape) if self._count > 1 else x)
+        with gpytorch.settings.debug(state=False):
+            found: Any = self.model(x.expand(self._count, *x.shape) if self._count > 1 else x)
         mean, variance = found.mean.reshape(self._count, -1).T, found.variance.reshape(self._count, -1).T
         return mean * self._scale + self._mean, variance.clamp_min(1e-12).sqrt() * self._scale
 
@@ -309,7 +311,7 @@ class _Merit(AcquisitionFunction):
     """`_Belief.merit` as BoTorch asks for it."""
 
     def __init__(self, belief: _Belief, caution: float, optimism: float) -> None:
-        super().__init__(model=belief.rates._model)
+        super().__init__(model=belief.rates.model)
         self._belief, self._caution, self._optimism = belief, caution, optimism
 
     @t_batch_mode_transform(expected_q=1, assert_output_shape=False)  # type: ignore[arg-type] # it types self as the base class
