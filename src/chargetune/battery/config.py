@@ -26,7 +26,7 @@ __all__ = ["CASE_STUDIES", "Config", "TunerName", "case_study", "load_config", "
 
 
 T = TypeVar("T", bound=BaseModel)
-TunerName = Literal["default", "ei", "sobol", "twin", "envelope"]
+TunerName = Literal["default", "ei", "sobol", "twin", "envelope", "composite"]
 RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
 

@@ -14,6 +14,7 @@ from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.claims import SeedRun, decide
 from chargetune.battery.config import CASE_STUDIES, Config, SafetyTable, TunerName, case_study, problem_of_document
 from chargetune.battery.twin import ChargingTwin
+from chargetune.battery.windows import ChargingWindows
 from chargetune.episode.episode import Episode
 from chargetune.study.store import Store
 from chargetune.study.study import Proposer, Study
@@ -53,6 +54,7 @@ def make_tuner(
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
         "sobol": lambda s: learning.Sobol(seed=s),
+        "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
         "envelope": lambda _: learning.Envelope(twin),
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }

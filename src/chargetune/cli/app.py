@@ -51,6 +51,7 @@ class TunerChoice(StrEnum):
     SOBOL = "sobol"
     TWIN = "twin"
     ENVELOPE = "envelope"
+    COMPOSITE = "composite"
 
 
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]

@@ -1,5 +1,6 @@
 """Tuners: pure functions that propose theta from the trials so far. Only this folder imports torch."""
 
+from chargetune.learning.composite import Composite
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.envelope import Envelope
 from chargetune.learning.expected_improvement import ExpectedImprovement
@@ -12,6 +13,6 @@ from chargetune.learning.twin import Twin, Uncertain
 from chargetune.learning.twin_tuner import TwinTuner
 
 __all__ = [
-    "ConstrainedLogEI", "Envelope", "ExpectedImprovement", "GaussianProcess", "NoSafeThetaError", "Posterior", "Safety", "Sobol",
-    "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
+    "Composite", "ConstrainedLogEI", "Envelope", "ExpectedImprovement", "GaussianProcess", "NoSafeThetaError", "Posterior", "Safety",
+    "Sobol", "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
 ]  # fmt: skip
