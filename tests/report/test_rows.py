@@ -1,6 +1,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,6 +47,14 @@ def test_head_names_limits_and_theta(view):
     assert [x["name"] for x in head["limits"]] == ["current_min_A", "current_max_A", "voltage_max_V", "voltage_min_V"]
     assert [x["entry"] for x in head["theta"]] == list(view.space.entries)
     assert (head["excess_unit"], head["tolerance"]) == ("mV", pytest.approx(35.0))
+
+
+def test_the_loss_is_named_by_what_is_minimised(view):
+    head = study_head(view)["loss_label"]
+    timed = replace(view, tuner="default", problem=replace(view.problem, charge_time_to_soc=0.8))
+    assert head == "-G"
+    assert study_head(replace(view, tuner="default"))["loss_label"] == "mean of (z_d - z)²"
+    assert study_head(timed)["loss_label"] == "time to 0.8 SOC / duration"
 
 
 def test_summary(stores):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["convergence_figure", "excess_unit", "incumbents", "loss", "worst_excess"]
+__all__ = ["convergence_figure", "excess_unit", "incumbents", "loss", "loss_label", "worst_excess"]
 
 
 def loss(view: StudyView, trial: Trial) -> float:
@@ -73,7 +73,7 @@ def convergence_figure(view: StudyView) -> Figure:
         lower.xaxis.set_major_locator(MaxNLocator(integer=True))
         if not any(trials for _, trials, _ in marks):
             upper.set_yticks([])
-        upper.set_ylabel(_loss_label(view))
+        upper.set_ylabel(loss_label(view))
         lower.set_ylabel(f"worst excess ({label})")
         lower.set_xlabel("trial")
         letter([upper, lower])
@@ -104,10 +104,14 @@ def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:
     return kinds
 
 
-def _loss_label(view: StudyView) -> str:
+def loss_label(view: StudyView) -> str:
+    """What `loss` is of this study, in plain text."""
     if view.tuner == "ei":
-        return "$-G$"
-    return "−objective" if view.problem is None else "mean of $(z_d - z)^2$"
+        return "-G"
+    if view.problem is None:
+        return "-objective"
+    mark = view.problem.charge_time_to_soc
+    return "mean of (z_d - z)²" if mark is None else f"time to {mark:.3g} SOC / duration"
 
 
 def excess_unit(view: StudyView) -> tuple[str, float]:

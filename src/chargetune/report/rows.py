@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
-from chargetune.report.convergence import excess_unit, loss, worst_excess
+from chargetune.report.convergence import excess_unit, loss, loss_label, worst_excess
 from chargetune.report.reading import StudyView
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -31,7 +31,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "tuner": view.tuner,
         "cell": "" if problem is None else problem.plant_cell.name,
         "remark": "" if problem is None else problem.plant_cell.remark,
-        "loss_label": "-G" if view.tuner == "ei" else "-objective" if problem is None else "mean of (z_d - z)²",
+        "loss_label": loss_label(view),
         "excess_unit": unit,
         "tolerance": scale * allowed.pop() if len(allowed) == 1 else None,
         "limits": limits_of(view),
