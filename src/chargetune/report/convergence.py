@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["convergence_figure", "excess_unit", "incumbents", "loss", "loss_label", "worst_excess"]
 
+# Labels of the loss as matplotlib sets them.
+TYPESET = {"-G": "$-G$", "-objective": "−objective", "mean of (z_d - z)²": "mean of $(z_d - z)^2$"}
+
 
 def loss(view: StudyView, trial: Trial) -> float:
     """What the tuner makes small: -objective, for the tuner "ei" -G; NaN without a score."""
@@ -73,7 +76,8 @@ def convergence_figure(view: StudyView) -> Figure:
         lower.xaxis.set_major_locator(MaxNLocator(integer=True))
         if not any(trials for _, trials, _ in marks):
             upper.set_yticks([])
-        upper.set_ylabel(loss_label(view))
+        loss_name = loss_label(view)
+        upper.set_ylabel(TYPESET.get(loss_name, loss_name))
         lower.set_ylabel(f"worst excess ({label})")
         lower.set_xlabel("trial")
         letter([upper, lower])
