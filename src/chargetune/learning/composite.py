@@ -33,10 +33,10 @@ __all__ = ["Composite", "CompositeLoop", "Passage"]
 DESIGN = 0.6
 # Standard deviations added to an excess by the cautious proposals, and taken off it by those that explore.
 CAUTION, OPTIMISM = 1.0, 1.0
-# Of a limit's tolerance, what a proposal may use. The rest is left to noise, whose largest value in a window counts.
-AIMED = 0.5
 # A per cent of the objective weighs as much as this excess beyond the tolerance, in tolerances, in one window.
 STIFFNESS = 0.5
+# The penalty makes a narrow valley along the limits: fewer iterations end on its slope, 5 % short of the best.
+STARTS, ITERATIONS = 3, 120
 # An output that was not measured is told with this variance, so that all are fitted in one go. Outputs are scaled to about one.
 UNKNOWN = 1e4
 JITTER = 1e-6
@@ -93,7 +93,7 @@ class Composite:
     g(h) = -sum(costs * widths / rate) and limits h <= tolerance are known functions of them, so that a window, which depends on
     few entries of theta and nearly linearly, is all that has to be learnt. Proposed is
 
-        max g(mean rate + o sd) - penalty * sum max(0, mean excess + c sd)^2
+        max g(mean rate + o sd) - penalty * sum max(0, mean excess + c sd - tolerance)^2
 
     by turns cautious (c = 0.5, o = 0) and optimistic (c = -1, o = 1): what would be better if it were so is tried. After
     theta_0 and ``n_initial`` Sobol points about it. Cut-short and failed trials teach by their traces. Running trials and the
@@ -155,7 +155,7 @@ class Composite:
         d = data.x.shape[1]
         points = torch.cat([candidates(d, seed, belief.x[belief.incumbent]), belief.x])
         away = AwayFromFailures(merit, torch.as_tensor(np.array(failed).reshape(-1, d)))
-        return maximise(away, points, data.x).numpy()
+        return maximise(away, points, data.x, starts=STARTS, iterations=ITERATIONS).numpy()
 
 
 @dataclass(frozen=True)
@@ -235,10 +235,10 @@ class _Belief:
         return -(self._costs * self._widths / rate).sum(-1)
 
     def merit(self, x: torch.Tensor, caution: float, optimism: float) -> torch.Tensor:
-        """g(rate + optimism sd) in per cent, less the squared excess of mean + caution sd, in tolerances; x (b, d) -> (b,)."""
+        """g(rate + optimism sd) in per cent, less the squared excess of mean + caution sd beyond the tolerance; x (b, d) -> (b,)."""
         mean, sd = self.rates(x)
         excess, deviation = self.excesses(x)
-        over = (excess + caution * deviation - AIMED * self.tolerances).clamp_min(0.0) / self.units
+        over = (excess + caution * deviation - self.tolerances).clamp_min(0.0) / self.units
         value: torch.Tensor = 100.0 / self.scale * self.objective(mean + optimism * sd) - (over / STIFFNESS).square().sum(-1)
         return value
 

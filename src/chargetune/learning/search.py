@@ -57,21 +57,24 @@ def maximise(
     acquisition: AcquisitionFunction,
     points: torch.Tensor,
     taken: Sequence[Sequence[float]] | NDArray[np.float64],
+    *,
+    starts: int = STARTS,
+    iterations: int = ITERATIONS,
 ) -> torch.Tensor:
-    """The best point found, shape (d,): the best ``points`` (m, d) improved by L-BFGS-B; never one of ``taken`` again."""
+    """The best point found, shape (d,): the ``starts`` best of ``points`` (m, d) improved by L-BFGS-B; never one of ``taken`` again."""
     with torch.no_grad():
         values = acquisition(points[:, None, :])
     values = torch.nan_to_num(values, nan=-torch.inf)
     best = points[values.argmax()]
-    start = points[values.topk(STARTS).indices][:, None, :]
+    start = points[values.topk(starts).indices][:, None, :]
     d = points.shape[1]
     try:
         with warnings.catch_warnings():
             # The iteration limit is meant.
             warnings.simplefilter("ignore")
             found, value = optimize_acqf(
-                acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=STARTS, batch_initial_conditions=start,
-                options={"maxiter": ITERATIONS},
+                acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=starts, batch_initial_conditions=start,
+                options={"maxiter": iterations},
             )  # fmt: skip
         if value is not None and torch.isfinite(value).all() and torch.isfinite(found).all():
             best = found[0]
