@@ -59,21 +59,23 @@ def maximise(
     taken: Sequence[Sequence[float]] | NDArray[np.float64],
     *,
     starts: int = STARTS,
+    also: torch.Tensor | None = None,
     iterations: int = ITERATIONS,
 ) -> torch.Tensor:
-    """The best point found, shape (d,): the ``starts`` best of ``points`` (m, d) improved by L-BFGS-B; never one of ``taken`` again."""
+    """The best point found, shape (d,): the ``starts`` best of ``points`` (m, d) and ``also`` (k, d) improved by L-BFGS-B; never one of ``taken`` again."""
     with torch.no_grad():
         values = acquisition(points[:, None, :])
     values = torch.nan_to_num(values, nan=-torch.inf)
     best = points[values.argmax()]
-    start = points[values.topk(starts).indices][:, None, :]
+    start = points[values.topk(starts).indices]
+    start = (start if also is None else torch.cat([start, also]))[:, None, :]
     d = points.shape[1]
     try:
         with warnings.catch_warnings():
             # The iteration limit is meant.
             warnings.simplefilter("ignore")
             found, value = optimize_acqf(
-                acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=starts, batch_initial_conditions=start,
+                acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=len(start), batch_initial_conditions=start,
                 options={"maxiter": iterations},
             )  # fmt: skip
         if value is not None and torch.isfinite(value).all() and torch.isfinite(found).all():
