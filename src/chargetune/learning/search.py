@@ -62,7 +62,10 @@ def maximise(
     also: torch.Tensor | None = None,
     iterations: int = ITERATIONS,
 ) -> torch.Tensor:
-    """The best point found, shape (d,): the ``starts`` best of ``points`` (m, d) and ``also`` (k, d) improved by L-BFGS-B; never one of ``taken`` again."""
+    """The best point found, shape (d,), never one of ``taken`` again.
+
+    L-BFGS-B from the ``starts`` best of ``points`` (m, d), and from ``also`` (k, d).
+    """
     with torch.no_grad():
         values = acquisition(points[:, None, :])
     values = torch.nan_to_num(values, nan=-torch.inf)
