@@ -1,11 +1,8 @@
 """Bad use of the commands: refused with exit code 2 and one message, before a store is made."""
 
 import json
-import sys
 
 import pytest
-
-from chargetune.cli import main
 
 STUDY = """
 [study]
@@ -24,18 +21,11 @@ upper_V = 0.2
 
 
 @pytest.fixture
-def chargetune(monkeypatch, capsys):
-    """The command in this process, which is quicker than a new one: exit code, stdout, stderr on one line."""
+def chargetune(chargetune_here):
+    """Exit code, stdout, stderr on one line."""
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as ended:
-            code = ended.code or 0
-        else:
-            code = 0
-        out, err = capsys.readouterr()
+        code, out, err = chargetune_here(*arguments)
         return code, out, " ".join(err.split())
 
     return run

@@ -1,10 +1,10 @@
 """``chargetune campaign`` as a user runs it."""
 
 import json
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
+
+from commands import chargetune
 
 from chargetune.battery.campaign import load_campaign
 
@@ -22,12 +22,6 @@ nodes = 3
 lower_V = 0.0
 upper_V = 0.2
 """
-
-
-def chargetune(*arguments, code=0):
-    done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    return done
 
 
 def test_table_resume_and_json(tmp_path):

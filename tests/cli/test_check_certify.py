@@ -1,12 +1,9 @@
 """check, certify and verify as a user runs them."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-
-from chargetune.cli import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -32,20 +29,6 @@ upper_V = 0.2
 
 
 @pytest.fixture
-def chargetune(monkeypatch, capsys):
-    """Run a command in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out = capsys.readouterr()
-        return ended.value.code, out.out, out.err
-
-    return run
-
-
-@pytest.fixture
 def study(tmp_path):
     def write(controller=""):
         path = tmp_path / "study.toml"
@@ -55,15 +38,15 @@ def study(tmp_path):
     return write
 
 
-def test_check_is_silent_on_an_example(chargetune, tmp_path):
-    code, out, _ = chargetune("check", EXAMPLES / "fast_charge.toml", "--json", "--figures", tmp_path / "f")
+def test_check_is_silent_on_an_example(chargetune_here, tmp_path):
+    code, out, _ = chargetune_here("check", EXAMPLES / "fast_charge.toml", "--json", "--figures", tmp_path / "f")
     assert code == 0
     assert json.loads(out) == {"file": str(EXAMPLES / "fast_charge.toml"), "findings": [], "figures": []}
-    assert "nothing found" in chargetune("check", EXAMPLES / "reference_model.toml")[1]
+    assert "nothing found" in chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
 
 
-def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune, study, tmp_path):
-    code, out, _ = chargetune("check", study("penalty_per_V = 0.01"), "--json", "--figures", tmp_path / "f")
+def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune_here, study, tmp_path):
+    code, out, _ = chargetune_here("check", study("penalty_per_V = 0.01"), "--json", "--figures", tmp_path / "f")
     told = json.loads(out)
     assert code == 1
     assert next((f["code"], f["severity"]) for f in told["findings"]) == ("inexact-penalty", "error")
@@ -71,55 +54,55 @@ def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune, study, t
     assert all(f["message"] and f["remedy"] for f in told["findings"])
     assert next(Path(f).name for f in told["figures"]) == "1-inexact-penalty.png"
     assert all(Path(f).read_bytes().startswith(b"\x89PNG") for f in told["figures"])
-    code, out, _ = chargetune("check", study("penalty_per_V = 0.01"))
+    code, out, _ = chargetune_here("check", study("penalty_per_V = 0.01"))
     assert code == 1
     assert "error inexact-penalty: the penalty of voltage_V" in out
     assert "what to do: a penalty" in out
 
 
-def test_a_warning_is_no_failure_and_entries_are_printed_with_their_brackets(chargetune, tmp_path):
+def test_a_warning_is_no_failure_and_entries_are_printed_with_their_brackets(chargetune_here, tmp_path):
     path = tmp_path / "s.toml"
     path.write_text(STUDY.format(controller="").split("[theta")[0] + "[theta.current_limit]\n")
-    code, out, _ = chargetune("check", path)
+    code, out, _ = chargetune_here("check", path)
     assert code == 0
     assert "current_limit[0]" in out
     assert "0 errors, 1 warnings" in out
 
 
-def test_a_theta_that_is_declared_safe_is_checked(chargetune, study):
-    assert chargetune("check", study(), "--safe", "0.2,0.2,0.2")[0] == 0
-    code, out, _ = chargetune("check", study(), "--safe", '{"backoff_V": [0, 0, 0]}', "--json")
+def test_a_theta_that_is_declared_safe_is_checked(chargetune_here, study):
+    assert chargetune_here("check", study(), "--safe", "0.2,0.2,0.2")[0] == 0
+    code, out, _ = chargetune_here("check", study(), "--safe", '{"backoff_V": [0, 0, 0]}', "--json")
     assert code == 1
     assert [f["code"] for f in json.loads(out)["findings"]] == ["unsafe-start"]
-    code, _, err = chargetune("check", study(), "--safe", "1,2")
+    code, _, err = chargetune_here("check", study(), "--safe", "1,2")
     assert code == 2
     assert "shape (2,)" in err
 
 
-def test_tune_stops_at_an_error_before_it_makes_a_store_unless_forced(chargetune, study, tmp_path):
+def test_tune_stops_at_an_error_before_it_makes_a_store_unless_forced(chargetune_here, study, tmp_path):
     store = tmp_path / "s.sqlite"
-    code, _, err = chargetune("tune", study("penalty_per_V = 0.01"), "--store", store)
+    code, _, err = chargetune_here("tune", study("penalty_per_V = 0.01"), "--store", store)
     assert code == 2
     assert "inexact-penalty" in err
     assert "--force" in err
     assert not store.exists()
-    code, out, err = chargetune("tune", study("penalty_per_V = 0.01"), "--store", store, "--trials", 1, "--force", "--json")
+    code, out, err = chargetune_here("tune", study("penalty_per_V = 0.01"), "--store", store, "--trials", 1, "--force", "--json")
     assert code == 0
     assert json.loads(out)["trials"] == 1
     assert "inexact-penalty" in err
 
 
 @pytest.fixture
-def store(chargetune, study, tmp_path):
+def store(chargetune_here, study, tmp_path):
     path = tmp_path / "s.sqlite"
-    assert chargetune("tune", study(), "--store", path)[0] == 0
+    assert chargetune_here("tune", study(), "--store", path)[0] == 0
     return path
 
 
-def test_certify_and_verify(chargetune, store, tmp_path):
+def test_certify_and_verify(chargetune_here, store, tmp_path):
     target = tmp_path / "out" / "c.json"
     some = ("--episodes", 30, "--resistance", 0.01, "--growth", 0.02)
-    code, out, _ = chargetune("certify", store, *some, "-o", target, "--json")
+    code, out, _ = chargetune_here("certify", store, *some, "-o", target, "--json")
     assert code == 0
     told = json.loads(out)
     assert told == json.loads(target.read_text())
@@ -128,24 +111,24 @@ def test_certify_and_verify(chargetune, store, tmp_path):
     assert told["origin"]["trials"] == 6
     assert {p.suffix for p in target.parent.iterdir()} == {".json", ".npz", ".png"}
     # The theta is that of the best feasible trial.
-    code, out, _ = chargetune("show", store, "--json")
+    code, out, _ = chargetune_here("show", store, "--json")
     best = json.loads(out)["studies"][0]["best"]
     assert list(told["theta"].values()) == best["theta"]
 
-    code, out, _ = chargetune("verify", target)
+    code, out, _ = chargetune_here("verify", target)
     assert code == 0
     assert "every figure is what the traces give" in out
     again = tmp_path / "again.json"
-    assert chargetune("certify", store, *some, "--workers", 2, "-o", again)[0] == 0
+    assert chargetune_here("certify", store, *some, "--workers", 2, "-o", again)[0] == 0
     assert json.loads(again.read_text())["figures"] == told["figures"]
     assert again.with_suffix(".npz").read_bytes() == target.with_suffix(".npz").read_bytes()
 
     told["figures"]["violations"] += 1
     target.write_text(json.dumps(told))
-    code, out, _ = chargetune("verify", target, "--json")
+    code, out, _ = chargetune_here("verify", target, "--json")
     assert code == 1
     assert {d["name"] for d in json.loads(out)["differences"]} == {"sha256", "violations"}
-    assert "violations: stated" in chargetune("verify", target)[1]
+    assert "violations: stated" in chargetune_here("verify", target)[1]
 
 
 @pytest.mark.parametrize(
@@ -157,18 +140,18 @@ def test_certify_and_verify(chargetune, store, tmp_path):
         (("-o", "c.txt"), "c.txt"),
     ],
 )
-def test_certify_refuses(arguments, words, chargetune, store):
-    code, _, err = chargetune("certify", store, *arguments)
+def test_certify_refuses(arguments, words, chargetune_here, store):
+    code, _, err = chargetune_here("certify", store, *arguments)
     assert code == 2
     assert words in err
 
 
-def test_a_study_without_a_trial_that_kept_the_limits_is_not_certified(chargetune, study, tmp_path):
+def test_a_study_without_a_trial_that_kept_the_limits_is_not_certified(chargetune_here, study, tmp_path):
     store = tmp_path / "s.sqlite"
-    assert chargetune("tune", study(), "--store", store, "--trials", 1)[0] == 0
-    code, _, err = chargetune("certify", store)
+    assert chargetune_here("tune", study(), "--store", store, "--trials", 1)[0] == 0
+    code, _, err = chargetune_here("certify", store)
     assert code == 2
     assert "no trial that kept every limit" in err
-    code, _, err = chargetune("verify", study())
+    code, _, err = chargetune_here("verify", study())
     assert code == 2
     assert "is not JSON" in err

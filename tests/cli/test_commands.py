@@ -10,31 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from chargetune.cli import main
+from commands import chargetune
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
-
-
-def chargetune(*arguments, cwd=None, code=0):
-    done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, cwd=cwd, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    return done
-
-
-@pytest.fixture
-def refused(monkeypatch, capsys):
-    """Run the command in this process, which is quicker than a new one; it must refuse with exit code 2 and one message."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == 2
-        return capsys.readouterr().err
-
-    return run
 
 
 def write(folder, text, name="study.toml"):

@@ -2,35 +2,15 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import chargetune
 
 from chargetune.battery.cell import load_cell
 from chargetune.battery.config import load_config
-from chargetune.cli import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def chargetune(*arguments, code=0):
-    done = subprocess.run([sys.executable, "-m", "chargetune", *map(str, arguments)], capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    return done
-
-
-@pytest.fixture
-def refused(monkeypatch, capsys):
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == 2
-        return capsys.readouterr().err
-
-    return run
 
 
 def test_identify_writes_a_cell_that_a_study_takes(shared, tmp_path):

@@ -1,5 +1,6 @@
 """A deterministic study in two parameters: a tuner that learns, an evaluation that violates, fails and leaves a trace."""
 
+import multiprocessing
 import os
 import time
 from dataclasses import dataclass
@@ -101,3 +102,14 @@ def open_study(store, name="toy", **changes):
 def essence(trials):
     """What must not depend on interruptions: all of a trial but times and provenance."""
     return [(t.number, t.theta, t.status, t.score, t.ending, t.seed, t.trace_sha256) for t in trials]
+
+
+def told_by_another_process(ask, *arguments):
+    """What ``ask(*arguments, connection)`` sends from a process of its own."""
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe()
+    process = fork.Process(target=ask, args=(*arguments, there))
+    process.start()
+    answer = here.recv()
+    process.join()
+    return answer

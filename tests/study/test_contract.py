@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sqlalchemy import Engine, event, text
-from study_toy import CONFIG, Toy, ToyEpisode, essence, open_study
+from study_toy import CONFIG, Toy, ToyEpisode, essence, open_study, told_by_another_process
 
 from chargetune.episode.score import Score
 from chargetune.study.store import Store, StoreError
@@ -377,12 +377,7 @@ def try_hold(location, connection):
 
 
 def free_for_others(location):
-    here, there = FORK.Pipe()
-    process = FORK.Process(target=try_hold, args=(location, there))
-    process.start()
-    free = here.recv()
-    process.join()
-    return free
+    return told_by_another_process(try_hold, location)
 
 
 class TestMark:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import Engine, event
-from study_toy import Toy, essence, open_study
+from study_toy import Toy, essence, open_study, told_by_another_process
 
 from chargetune.study.check import check_store
 from chargetune.study.executors import process_executor
@@ -154,12 +154,7 @@ def try_lease(path, connection):
 
 
 def free_for_others(path):
-    here, there = FORK.Pipe()
-    process = FORK.Process(target=try_lease, args=(path, there))
-    process.start()
-    free = here.recv()
-    process.join()
-    return free
+    return told_by_another_process(try_lease, path)
 
 
 def test_lease_counts_within_a_process_and_is_not_inherited(tmp_path):
