@@ -96,7 +96,7 @@ class Composite:
 
         max g(mean rate + o sd) - penalty * sum max(0, mean excess + c sd - tolerance)^2
 
-    by turns cautious (c = 0.5, o = 0) and optimistic (c = -1, o = 1): what would be better if it were so is tried. After
+    by turns cautious (c = 1, o = 0) and optimistic (c = -1, o = 1): what would be better if it were so is tried. After
     theta_0 and ``n_initial`` Sobol points about it. Cut-short and failed trials teach by their traces. Running trials and the
     earlier thetas of a batch are taken as if they had shown their means.
     Source: Astudillo and Frazier, ICML 2019 (composite functions); Xu et al., PMLR 211 (2023) 1 (optimism about limits).
