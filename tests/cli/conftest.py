@@ -1,10 +1,14 @@
 """The command in the process of the tests, which is quicker than a new one."""
 
 import sys
+from pathlib import Path
 
 import pytest
 
 from chargetune.cli import main
+
+# So that the tests here find the module `commands`.
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture
