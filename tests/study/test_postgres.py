@@ -73,18 +73,18 @@ class Wire:
             threading.Thread(target=self.back, args=(there, here), daemon=True).start()
 
     def forward(self, source, sink):
-        while data := receive(source):
-            sink.sendall(data)
-        end(sink)
+        while (data := receive(source)) and send(sink, data):
+            pass
+        end(source, sink)
 
     def back(self, source, sink):
         while data := receive(source):
             if self.deaf and b"COMMIT\0" in data:
                 self.deaf, self.broken = False, self.broken + 1
                 break
-            sink.sendall(data)
-        end(sink)
-        end(source)
+            if not send(sink, data):
+                break
+        end(source, sink)
 
 
 def receive(connection):
@@ -94,10 +94,21 @@ def receive(connection):
         return b""
 
 
-def end(connection):
-    with contextlib.suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
-    connection.close()
+def send(connection, data):
+    """Whether the other side still listens."""
+    try:
+        connection.sendall(data)
+    except OSError:
+        return False
+    return True
+
+
+def end(*connections):
+    # Both sides, whichever broke: the other thread, waiting for one of them, ends too.
+    for connection in connections:
+        with contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        connection.close()
 
 
 @pytest.fixture
