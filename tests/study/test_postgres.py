@@ -128,6 +128,7 @@ ACTS = {
     "add_trials": lambda s, k: s.add_trials(1, [Trial(len(s.trials(1)), (0.5,), asked_at="t")]),
     "hand_out": lambda s, k: s.hand_out(1, [t for t in s.trials(1) if not t.attempt][:1], "w"),
     "finish_trial": lambda s, k: s.finish_trial(1, k, score=SCORE, ending="done", trace=TRACE, provenance={}),
+    "count_loss": lambda s, _: s.count_loss(1, 2),
     "change_study": lambda s, k: s.change_study(1, {"config": {"k": k}}),
     "note_holder": lambda s, k: s.note_holder(1, 1, "host"),
 }
@@ -146,6 +147,8 @@ def test_a_commit_whose_answer_is_lost_happens_once(wire, act):
         after = len(store.studies()), len(store.trials(1)), sum(t.attempt for t in store.trials(1))
         grown = {"add_study": (1, 0, 0), "add_trials": (0, 1, 0), "hand_out": (0, 0, 1)}.get(act, (0, 0, 0))
         assert tuple(a - b for a, b in zip(after, before, strict=True)) == grown
+        if act == "count_loss":
+            assert store.trials(1)[2].losses == 2
         if act == "finish_trial":
             assert [t.status for t in store.trials(1)] == ["done", "done", "running"]
 

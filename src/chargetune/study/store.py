@@ -267,13 +267,16 @@ class Store:
     def count_loss(self, study_id: int, number: int, by: int = 1, *, term: int | None = None) -> int:
         """Add to how many workers a running trial has lost, and give that number."""
         where = (schema.trial.c.study_id == study_id, schema.trial.c.number == number)
+        losses: int | None = None
 
         def count(connection: Connection) -> int:
+            nonlocal losses
             provenance = json.loads(connection.execute(select(schema.trial.c.provenance).where(*where)).scalar_one())
-            provenance["losses"] = provenance.get("losses", 0) + by
-            text = canonical_json(provenance, "provenance")
+            # Tried again after a lost answer it must not count twice.
+            losses = int(provenance.get("losses", 0)) + by if losses is None else losses
+            text = canonical_json({**provenance, "losses": losses}, "provenance")
             connection.execute(update(schema.trial).where(*where).values(provenance=text))
-            return int(provenance["losses"])
+            return losses
 
         return self.write(count, study_id, term)
 
