@@ -97,6 +97,27 @@ def test_one_worker_gives_the_trials_of_batches_of_one(store, tmp_path):
         assert all(t.provenance["pending"] == [] for t in study.trials())
 
 
+def test_each_trial_says_from_what_it_was_proposed(store, tmp_path):
+    def learnt(study):
+        return [t.provenance["learnt_sha256"] for t in study.trials()]
+
+    with open_study(store, batch=2) as study:
+        study.run(Toy(), 6)
+        found = learnt(study)
+    assert found[::2] == found[1::2]
+    assert len(set(found)) == 3
+    with Store(tmp_path / "again.db") as other, open_study(other, batch=2) as study:
+        study.run(Toy(), 3)
+        study.run(Toy(), 6)
+        assert learnt(study) == found
+    with Store(tmp_path / "other.db") as other, open_study(other, batch=2) as study:
+        (first, _) = study.ask(2)
+        study.fail(first.number, "the sensor")
+        study.run(Toy(), 4)
+        assert learnt(study)[0] == found[0]
+        assert learnt(study)[2] != found[2]
+
+
 def test_a_free_worker_is_given_a_new_theta_at_once(store):
     """Trial 0 ends when trial 5 has begun: with batches that would wait for ever."""
     sixth = threading.Event()

@@ -19,7 +19,7 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.database import Hold
-from chargetune.study.document import score_to_json
+from chargetune.study.document import canonical_json, score_to_json, sha256
 from chargetune.study.earlier import Earlier, read_earlier
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import process_executor
@@ -27,6 +27,7 @@ from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.notebook import study_html, trials_dataframe
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
+from chargetune.study.records import result_of
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
 from chargetune.study.store import Store, StudyRecord
@@ -158,7 +159,7 @@ class Study:
         if isinstance(n, bool) or not isinstance(n, int) or n < 1:
             raise ValueError(f"n = {n!r}, allowed is an integer >= 1")
         trials = self.trials()
-        return self._record(len(trials), self._propose(trials, n))
+        return self._record(len(trials), self._propose(trials, n), trials)
 
     def ask_batch(self, limit: int) -> list[Trial]:
         """The rest of the next batch up to trial number ``limit - 1``, as `run` asks; empty when there are ``limit`` trials.
@@ -176,7 +177,7 @@ class Study:
             raise StudyError(f"the trials {waiting} are not told, the next batch is proposed when they are")
         # A batch that was cut by an earlier limit is proposed again as a whole: the tuner is a pure function.
         thetas = self._propose(before, self.batch)[len(trials) - first :]
-        return self._record(len(trials), thetas[:count])
+        return self._record(len(trials), thetas[:count], before)
 
     def hand_out(self, trials: Sequence[Trial], worker: str = "") -> list[Trial]:
         """Record that these running trials begin now, and where; gives them with the number of this attempt.
@@ -291,7 +292,7 @@ class Study:
         if len(trials) >= limit:
             return []
         pending = [t.number for t in trials if t.status is TrialStatus.RUNNING]
-        return self._record(len(trials), self._propose(trials, 1), {"pending": pending})
+        return self._record(len(trials), self._propose(trials, 1), trials, pending=pending)
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
         known = [*self.earlier, *trials]
@@ -310,8 +311,11 @@ class Study:
             # A trace of the caller's own shape is kept for the caller, and is nothing that a tuner can read.
             return None
 
-    def _record(self, first: int, thetas: Sequence[tuple[float, ...]], more: Mapping[str, Any] | None = None) -> list[Trial]:
-        now, made_with = utc_now(), {**self._provenance(), **(more or {})}
+    def _record(self, first: int, thetas: Sequence[tuple[float, ...]], known: Sequence[Trial], **more: Any) -> list[Trial]:
+        # A tuner, and the twin in it, is a pure function of the trials it was given, so these are its whole state.
+        state = [[t.number, list(t.theta), *result_of(t)] for t in (*self.earlier, *known)]
+        made_with = {**self._provenance(), "learnt_sha256": sha256(canonical_json(state, "trials")), **more}
+        now = utc_now()
         trials = [
             Trial(number, theta, seed=trial_seed(self.seed, number), asked_at=now, provenance=made_with)
             for number, theta in enumerate(thetas, start=first)

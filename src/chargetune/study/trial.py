@@ -40,7 +40,8 @@ class Trial:
     trace_sha256
         SHA-256 of the stored trace, None when there is none.
     provenance
-        Hash of the study's configuration, versions of the programs, machine; ``pending``: numbers of the trials that were
+        Hash of the study's configuration, versions of the programs, machine; ``learnt_sha256``: hash of the trials that theta was
+        proposed from, which are the whole state of a tuner and its twin; ``pending``: numbers of the trials that were
         running when it was proposed beside them; ``losses``: how many workers were lost by it.
     attempt
         How often the trial was handed out to a worker; the result of an attempt before the last one is refused.
