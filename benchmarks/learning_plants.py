@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 
@@ -12,7 +13,7 @@ from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import load_config
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.electrochemical import Electrochemical
-from chargetune.battery.theta import Backoff, ResistanceRatio
+from chargetune.battery.theta import Backoff, LimitBackoff, ResistanceRatio
 from chargetune.model.model import Model, Signal
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
@@ -26,10 +27,13 @@ STUDIES = {
     "backoff": {"backoff": Backoff(lower_V=0.0, upper_V=0.2)},
     "model": {"ratios": (ResistanceRatio("R1"),)},
 }
-# PyBaMM's DFN by ambient temperature in K and largest current in A; the controller's circuit is that of the example.
-DFN = {"dfn": (298.15, 10.0), "dfn-283K": (283.15, 10.0), "dfn-3C": (298.15, 15.0)}
+# PyBaMM's DFN by ambient temperature in K, largest current in A, and whether temperature and anode potential are limited too.
+DFN = {
+    "dfn": (298.15, 10.0, False), "dfn-283K": (283.15, 10.0, False), "dfn-3C": (298.15, 15.0, False),
+    "dfn-limits": (298.15, 10.0, True), "dfn-3C-limits": (298.15, 15.0, True),
+}  # fmt: skip
 PLANTS = ("ecm", "unknown", "structural", *DFN)
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_fast_charge.toml"
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_safe_charge.toml"
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,8 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
         raise ValueError(f"plant = {plant!r}, study = {study!r}; allowed are {', '.join(PLANTS)} and {', '.join(STUDIES)}")
     sensors = Sensors(noise_sd={"voltage_V": noise_V}) if noise_V else Sensors()
     if plant in DFN:
-        return _dfn(*DFN[plant], study, sensors)
+        ambient_K, current_max_A, limits = DFN[plant]
+        return _dfn(ambient_K, current_max_A, study, sensors, limits=limits)
     cell = default_cell()
     problem = ChargingProblem(
         cell,
@@ -110,15 +115,24 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
     return problem
 
 
-def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors) -> ChargingProblem:
-    """Voltage limit alone, SOC measured, overpotential by the controller's own model; the seed decides the noise and nothing else."""
+def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors, *, limits: bool) -> ChargingProblem:
+    """SOC measured, overpotential by the controller's own model; the seed decides the noise and nothing else.
+
+    ``limits``: not the voltage's alone but also at most 318.15 K and no lithium plating, both with a backoff in theta.
+    """
     problem = load_config(EXAMPLE).problem(EXAMPLE.parent)
     cell, plant = problem.plant_cell, problem.plant_model
     if cell.thermal is None or not isinstance(plant, Electrochemical):
         raise TypeError(f"{EXAMPLE.name} is to describe a cell with a temperature and an electrochemical plant")
+    settings: dict[str, Any] = dict(STUDIES[study])
+    if limits:
+        settings |= {
+            "temperature_max_K": 318.15, "tolerance_K": 0.2, "anode_min_V": 0.0, "tolerance_anode_V": 1e-3,
+            "limit_backoffs": (LimitBackoff("temperature", -8.0, 8.0), LimitBackoff("anode", -0.05, 0.05, nodes=6)),
+        }  # fmt: skip
     return ChargingProblem(
         replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, verdict_samples=5,
-        charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **STUDIES[study],  # type: ignore[arg-type]
+        charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **settings,
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """From a cell on the bench to the cell file of a controller: here the bench is PyBaMM's DFN.
 
-Run: python examples/electrochemical_cell.py OUT.toml. A pulse test at 298 K gives the circuit, pulse tests at two more
-temperatures how its resistance falls when it warms, and one charge its heat capacity and cooling.
-`examples/okane2022.toml` was made by this script.
+Run: python examples/electrochemical_cell.py FOLDER. A pulse test at 298 K gives the circuit, pulse tests at two more
+temperatures how its resistance falls when it warms, and one charge its heat capacity and cooling: `okane2022.toml`. A slow
+charge more, with a reference electrode, gives the anode potential too: `okane2022_anode.toml`.
 """
 
 import sys
@@ -14,6 +14,7 @@ import numpy as np
 from chargetune.battery.baselines import charge, constant_current
 from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.identify import cell_toml, identify
+from chargetune.battery.identify_anode import with_anode
 from chargetune.battery.identify_thermal import activation_energy, with_thermal
 from chargetune.battery.limits import Limit
 from chargetune.battery.pulse_test import pulse_test
@@ -53,4 +54,7 @@ cell = replace(
     remark="R-RC circuit identified from simulated pulses on PyBaMM's DFN with the parameters of O'Kane et al., PCCP 24 (2022) 7909.",
 )
 print(f"E = {energy:.0f} J/mol, C = {cell.thermal.heat_capacity_J_K:.1f} J/K, hA = {cell.thermal.cooling_W_K:.4f} W/K")
-Path(sys.argv[1] if len(sys.argv) > 1 else "okane2022.toml").write_text(cell_toml(cell), encoding="utf-8")
+slow = charge(bench(298.15, 60.0, 0.02), constant_current(1.0), [limit], steps=300, soc_target=1.0, current_max_A=1.0)
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+for name, one in (("okane2022.toml", cell), ("okane2022_anode.toml", with_anode(cell, [slow, run]))):
+    (folder / name).write_text(cell_toml(one), encoding="utf-8")

@@ -251,3 +251,28 @@ def test_a_cache_that_cannot_be_written(tank_controller, tank_plant, monkeypatch
         assert not compiled_episode(tank_controller(), tank_plant(), 20).compiled
     with pytest.raises(OSError, match="a file"):
         compiled_episode(tank_controller(), tank_plant(), 20, compiled=True)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="an ensemble shares the cores where its loop is compiled")
+@pytest.mark.parametrize("count", [1, 5, 37])
+def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
+    controller, plant = loop(charging, "all of these")
+    episodes = compiled_episode(controller, plant, 40)
+    draws = np.random.default_rng(0).uniform(0.7, 1.3, count)
+    nominal = np.array(dict(plant.model.parameters)["R0_ohm"])
+    plants = [replace(plant, model=plant.model.with_parameters(R0_ohm=tuple(f * nominal)), start={"soc": 0.1 * f}) for f in draws]
+    thetas = [f * np.array(THETA) for f in draws]
+    together = episodes.run_each(thetas, plants, seed=3)
+    assert len(together) == count
+    for theta, one, episode in zip(thetas, plants, together, strict=True):
+        same(episode, replace(episodes, plant=one).run(theta, 3))
+
+
+def test_an_ensemble_refuses_what_does_not_belong_to_it(charging):
+    controller, plant = loop(charging, "ideal")
+    episodes = compiled_episode(controller, plant, 10)
+    with pytest.raises(ValueError, match="2 thetas and 1 plants"):
+        episodes.run_each([THETA, THETA], [plant])
+    other = replace(plant, model=replace(plant.model, f=ca.Function("f", list(plant.model.f.sx_in()), [plant.model.f.sx_in()[0]])))
+    with pytest.raises(ValueError, match=r"plants\[1\] has another model"):
+        episodes.run_each([THETA, THETA], [plant, other])

@@ -9,6 +9,8 @@ import pytest
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRatio
 from chargetune.battery.estimation import Kalman
+from chargetune.battery.thermal import Anode, Thermal
+from chargetune.battery.theta import LimitBackoff
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning import Envelope
 from chargetune.learning.envelope import covering, predicted_rows
@@ -76,6 +78,30 @@ def test_a_few_steps_ride_the_limit_of_an_exact_plant(parts, attainable):
     metrics = problem.score(problem.episode(theta)).metrics
     assert metrics["overshoot_mV"] < 1.0
     assert metrics["t95_min"] < 1.02 * attainable
+
+
+def test_every_limit_that_holds_the_controller_back_is_covered():
+    """Voltage, temperature and anode potential, far apart in their units, each with a backoff that was far too large."""
+    warm = replace(
+        CELL,
+        thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1),
+        anode=Anode((0.0, 1.0), (0.25, 0.05), (0.02, 0.02)),
+    )
+    parts = (LimitBackoff("temperature", -5.0, 10.0), LimitBackoff("anode", -0.1, 0.1, nodes=3))
+    problem = ChargingProblem(warm, mismatch_seed=1, backoff=Backoff(), limit_backoffs=parts, temperature_max_K=308.0, anode_min_V=0.0)
+    theta = problem.space.upper
+    slow = problem.score(problem.episode(theta))
+    assert slow.metrics["t80_min"] is None
+    for _ in range(6):
+        episode = problem.episode(theta)
+        theta = covering(problem.controller, episode, theta, problem.measured_rows(episode))
+    verdict = problem.score(problem.episode(theta))
+    assert verdict.metrics["overshoot_mV"] < 1.0
+    assert verdict.excess["temperature_max_K"] < 0.05
+    assert verdict.excess["anode_min_V"] < 1e-3
+    # The controller's model of both is exact, so it needs no backoff, and one of them is ridden.
+    assert max(verdict.excess["temperature_max_K"] / 0.1, verdict.excess["anode_min_V"] / 1e-3) > -1
+    assert verdict.metrics["t80_min"] < 40
 
 
 def test_what_no_sample_asks_for_stays():

@@ -1,19 +1,23 @@
 """Safe learning: what reaches the plant, what it promises, and when it stops."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from two_pairs import TwoPairs
 
-from chargetune.battery.cell import default_cell
+from chargetune.battery.cell import Cell, default_cell
 from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRatio
+from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.thermal import Anode, Thermal
+from chargetune.battery.theta import LimitBackoff
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
 from chargetune.learning.belief import believe
 from chargetune.plants.sensors import Sensors
+from chargetune.plants.simulated import SimulatedPlant
 
 CELL = default_cell()
 
@@ -22,6 +26,16 @@ def charge(seed=1, noise=0.002, **changes):
     sensors = Sensors(noise_sd={"voltage_V": noise}) if noise else Sensors()
     parts = {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)} | changes
     return ChargingProblem(CELL, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **parts)
+
+
+@dataclass(frozen=True)
+class AnotherCell:
+    """The circuit of this cell as plant, whatever the learner knows."""
+
+    cell: Cell
+
+    def plant(self, soc_start, sampling_time_s, sensors):
+        return SimulatedPlant(ecm_model(self.cell, sampling_time_s), start_state(self.cell, soc_start), sensors)
 
 
 def told(number, theta, score, episode):
@@ -56,6 +70,30 @@ def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
     assert max(excess) <= 5.0
     assert excess[-1] <= 2.0
     assert minutes[-1] < 50.0
+
+
+def test_temperature_and_anode_potential_are_kept_while_learning():
+    """The learner's anode table is off by 10 mV and a fifth of its resistance, its circuit by up to half of its own."""
+    true = replace(
+        CELL,
+        thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1, activation_J_mol=15e3),
+        anode=Anode((0.0, 0.5, 1.0), (0.25, 0.06, 0.04), (0.02, 0.02, 0.025)),
+    )
+    believed = replace(true, anode=Anode((0.0, 0.5, 1.0), (0.26, 0.07, 0.05), (0.016, 0.016, 0.02)))
+    problem = ChargingProblem(
+        believed, mismatch_seed=1, plant_model=AnotherCell(true), sensors=Sensors(noise_sd={"voltage_V": 2e-3}), verdict_samples=5,
+        backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3), temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8,
+        limit_backoffs=(LimitBackoff("temperature", -5.0, 5.0), LimitBackoff("anode", -0.05, 0.05, nodes=4)),
+    )  # fmt: skip
+    loop = ChargingTwin(problem)
+    assert set(loop.twin.noise_sd) == {"voltage_V", "temperature_K", "anode_potential_V"}
+    assert loop.unpredicted == ()
+    trials, excess, _ = learn(problem, TwinTuner(loop, safety=Safety(start=tuple(problem.space.upper))), 4)
+    assert max(excess) <= 5.0
+    assert max(t.score.excess["temperature_max_K"] for t in trials) <= 0.5
+    assert max(t.score.excess["anode_min_V"] for t in trials) <= 5e-3
+    times = [t.score.metrics["t80_min"] or np.inf for t in trials]
+    assert times[-1] < 0.8 * times[1]
 
 
 def test_the_first_theta_is_the_declared_one_or_the_corner_that_is_safe():

@@ -27,14 +27,17 @@ def twin_of(problem, **changes):
 
 def test_sensitivities_are_those_of_finite_differences():
     twin = Twin(
-        ecm_model(CELL), (Uncertain("R1_ohm", 0.3), Uncertain("capacity_Ah", 0.1, "offset"), Uncertain("soc", 0.02, "start")),
+        ecm_model(CELL), (
+            Uncertain("R1_ohm", 0.3), Uncertain("capacity_Ah", 0.1, "offset"),
+            Uncertain("soc", 0.02, "start"), Uncertain("voltage_V", 0.01, "bias"),
+        ),
         {"voltage_V": 1e-3, "soc": 1e-3}, start_state(CELL, 0.3),
     )  # fmt: skip
     inputs = np.random.default_rng(0).uniform(-2, 5, (15, 1))
-    m = 0.05 * np.random.default_rng(1).standard_normal(11)
+    m = 0.05 * np.random.default_rng(1).standard_normal(12)
     posterior = twin.fit([])
-    slopes = replace(posterior, mode=m, root=np.eye(11)).predicted_sd(inputs) ** 2 - np.array([1e-6, 1e-6])
-    differences = [(twin.predict(m + h, inputs) - twin.predict(m - h, inputs)) / 2e-5 for h in 1e-5 * np.eye(11)]
+    slopes = replace(posterior, mode=m, root=np.eye(12)).predicted_sd(inputs) ** 2 - np.array([1e-6, 1e-6])
+    differences = [(twin.predict(m + h, inputs) - twin.predict(m - h, inputs)) / 2e-5 for h in 1e-5 * np.eye(12)]
     np.testing.assert_allclose(slopes, np.sum(np.square(differences), axis=0), rtol=1e-4, atol=1e-9)
 
 
@@ -85,6 +88,20 @@ def test_missing_samples_and_short_traces_are_taken_as_they_are():
     assert np.trace(part.covariance) > np.trace(whole.covariance)
 
 
+def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
+    """What a real cell does not tell: the charge that it holds, where it starts, an OCV that is off."""
+    loop = ChargingTwin(charge(seed=2), capacity_spread=0.05, soc_spread=0.02, ocv_spread_V=0.005)
+    true = np.append(np.zeros(27), [-0.03, 0.015, 0.004])
+    theta = loop.problem.space.default
+    episode = loop.simulate([(theta, true, None)])[0]
+    at_rest = loop.simulate([(theta, np.append(true[:-1], 0.0), None)])[0]
+    np.testing.assert_allclose(episode.signal("voltage_V")[1] - at_rest.signal("voltage_V")[1], 0.004, atol=1e-12)
+    posterior = loop.twin.fit([episode])
+    off = np.abs(posterior.mode - true)[-3:] / np.sqrt(np.diag(posterior.covariance))[-3:]
+    assert np.all(off < 3)
+    assert np.all(np.sqrt(np.diag(posterior.covariance))[-3:] < [0.02, 0.01, 0.005])
+
+
 def test_what_the_model_cannot_represent_is_a_discrepancy():
     problem = charge(noise=0.0005)
     episode = problem.episode()
@@ -102,6 +119,7 @@ def test_what_the_model_cannot_represent_is_a_discrepancy():
         (lambda: Uncertain("R0_ohm", 0.1, smooth=1.0), "smooth of R0_ohm = 1.0"),
         (lambda: Uncertain("R0_ohm", 0.1, "ratio"), "kind of R0_ohm = 'ratio'"),
         (lambda: Twin(ecm_model(CELL), (Uncertain("R9", 0.1),), {"voltage_V": 1e-3}), "unknown factor 'R9'"),
+        (lambda: Twin(ecm_model(CELL), (Uncertain("soc", 0.1, "bias"),), {"voltage_V": 1e-3}), "unknown bias 'soc', allowed are voltage_V"),
         (lambda: Twin(ecm_model(CELL), (), {"voltage_V": 1e-3}), "at least one"),
         (lambda: Twin(ecm_model(CELL), (Uncertain("R0_ohm", 0.1),), {"current": 1e-3}), "noise_sd names ['current']"),
         (lambda: Twin(ecm_model(CELL), (Uncertain("R0_ohm", 0.1),), {"voltage_V": 0.0}), "finite numbers > 0"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -20,15 +20,15 @@ from chargetune.episode.score import Score
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
-    from chargetune.learning.discrepancy import OutputError
+    from chargetune.learning.belief import Case
     from chargetune.learning.twin import Twin
 
 __all__ = ["ChargingTwin"]
 
-# A voltage sensor without stated noise is trusted to this, V; a temperature sensor to this, K.
-LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05}
+# A sensor without stated noise is trusted to this.
+LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e-3}
 # A circuit's prediction is off by at least about this where it was not measured.
-LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3}
+LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 0.3
 # Windows of the SOC in which a predicted excess is told to the search.
@@ -40,8 +40,8 @@ class ChargingTwin:
     """Closed loops of ``problem`` on circuits whose R and C tables are the controller's own times exp(m).
 
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
-    nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative) and ``soc_spread`` are
-    those of the capacity and of the SOC at the start, 0 where these are known.
+    nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
+    ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
     """
 
     problem: ChargingProblem
@@ -49,20 +49,23 @@ class ChargingTwin:
     smooth: float = 0.3
     capacity_spread: float = 0.0
     soc_spread: float = 0.0
+    ocv_spread_V: float = 0.0
 
     @cached_property
     def twin(self) -> Twin:
-        """Unknown tables over SOC; measured voltage, and temperature where the cell has one."""
+        """Unknown tables over SOC; measured voltage, temperature and limited anode potential where the cell has them."""
         from chargetune.learning.twin import Twin, Uncertain
 
         problem = self.problem
         belief = problem.controller_cell
         model = ecm_model(problem.plant_cell, problem.sampling_time_s).with_parameters(**{n: getattr(belief, n) for n in belief.tables})
-        names = ("voltage_V", *(["temperature_K"] if belief.thermal else []))
+        anode = belief.anode is not None and problem.anode_min_V is not None
+        names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
+        unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
         error = {name: LEAST_ERROR[name] for name in names}
         # Of the cell's own circuit the OCV is known. Of another plant it was identified, worst near full.
         at_rest = OCV_SHARE if problem.plant_model else 0.0
@@ -89,16 +92,20 @@ class ChargingTwin:
     def row_tolerances(self) -> NDArray[np.float64]:
         return self.problem.row_tolerances
 
-    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64], error: OutputError | None = None) -> Episode | None:
-        """One charge without noise, ``error`` added to what it measures."""
+    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+        """Charges without noise, with the third of each case added to what is measured."""
+        episodes = self._loop.run_each([theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases])
+        out: list[Episode | None] = []
+        for episode, (_, unknowns, error) in zip(episodes, cases, strict=True):
+            biased = _shifted(episode, self.twin.biases(unknowns))
+            out.append(None if episode.ending is not Ending.DONE else error(biased) if error else biased)
+        return out
+
+    def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
         sizes, own = self.twin.model.parameter_blocks, self._loop.plant
         values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
         start = dict(zip(own.model.state_names, (float(v) for v in self.twin.start_state(unknowns)), strict=True))
-        plant = replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
-        episode = replace(self._loop, plant=plant).run(theta)
-        if episode.ending is not Ending.DONE:
-            return None
-        return error(episode) if error else episode
+        return replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
 
     def violation(self, episode: Episode) -> float:
         """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""
@@ -128,3 +135,11 @@ class ChargingTwin:
         if not isinstance(plant, SimulatedPlant):
             raise TypeError("the twin's plant is a simulated circuit")
         return compiled_episode(self.problem.controller, plant, problem.steps)
+
+
+def _shifted(episode: Episode, biases: Mapping[str, float]) -> Episode:
+    """The episode with constants added to its measured outputs."""
+    if not biases:
+        return episode
+    shift = np.array([biases.get(name, 0.0) for name in episode.output_names])
+    return replace(episode, output_start=episode.output_start + shift, output_end=episode.output_end + shift)

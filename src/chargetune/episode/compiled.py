@@ -7,6 +7,7 @@ thetas, seeds and mismatches builds it once. It gives the same trajectory as `ru
 from __future__ import annotations
 
 import hashlib
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.control.controller import Controller
@@ -26,6 +27,9 @@ from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
+
+# Loops of an ensemble that each core runs before the results are taken up.
+SHARE = 8
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,45 @@ class CompiledEpisode:
 
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
         """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
-        controller, plant = self.controller, self.plant
+        given, unknown = self._arguments(theta, self.plant, seed, trips)
+        return self._episode(_evaluated(self.function, given, unknown, (self.steps, sum(self.widths))), self.plant, seed, trips)
+
+    def run_each(self, thetas: Sequence[ArrayLike | None], plants: Sequence[SimulatedPlant], seed: int = 0) -> list[Episode]:
+        """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
+
+        The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
+        Raises ValueError when there are not as many of both, or one does not fit.
+        """
+        if len(thetas) != len(plants):
+            raise ValueError(f"{len(thetas)} thetas and {len(plants)} plants, allowed are as many of both")
+        for i, plant in enumerate(plants):
+            if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
+                raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if cores == 1 or len(plants) < 2 or not self.compiled:
+            return [replace(self, plant=plant).run(theta, seed) for theta, plant in zip(thetas, plants, strict=True)]
+        width = SHARE * cores
+        together = cached(
+            f"{width} on {cores} cores of {id(self.function)}", lambda: (self.function, self.function.map(width, "thread", cores))
+        )[1]
+        out: list[Episode] = []
+        for first in range(0, len(plants), width):
+            part = list(zip(thetas[first : first + width], plants[first : first + width], strict=True))
+            given, unknown = zip(*(self._arguments(theta, plant, seed, ()) for theta, plant in part), strict=True)
+            spare = width - len(part)
+            # The function has this one width: the last loop fills what is left of it.
+            recorded = _evaluated(
+                together, np.stack([*given, *given[-1:] * spare]), np.stack([*unknown, *unknown[-1:] * spare]),
+                (width, self.steps, sum(self.widths)),
+            )  # fmt: skip
+            out += [self._episode(one, plant, seed, ()) for one, (_, plant) in zip(recorded, part, strict=False)]
+        return out
+
+    def _arguments(
+        self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What is given once an episode, shape (n,), and once an interval, shape (steps, m)."""
+        controller = self.controller
         values = controller.theta_vector(theta)
         check_run(plant, self.steps, seed, trips)
         memory = begin(controller)
@@ -57,15 +99,10 @@ class CompiledEpisode:
         start_state, plant_q = plant.start_state, self.prepare_plant(plant.model.nominal)
         fixed = (start_state, memory.estimator, memory.last_input, memory.warm, q, plant_q, resolution, errors[0, 1])
         given = np.concatenate([np.asarray(part, dtype=float).ravel() for part in fixed])
-        unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
-        recorded = np.empty((self.steps, sum(self.widths)))
-        # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.
-        buffer: Any
-        buffer, evaluate = self.function.buffer()
-        buffer.set_arg(0, given.data)
-        buffer.set_arg(1, unknown.data)
-        buffer.set_res(0, recorded.data)
-        evaluate()
+        return given, np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
+
+    def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
+        controller, start_state = self.controller, plant.start_state
         state, u, true_start, true_end, start, end, estimate, facts = np.split(recorded, np.cumsum(self.widths)[:-1], axis=1)
         episode = Episode(
             sampling_time_s=plant.sampling_time_s,
@@ -89,6 +126,20 @@ class CompiledEpisode:
         )
         at_rest = tripped(plant, replace(plant).reset(seed), trips) if trips else ""
         return episode.cut(0, Ending.LIMIT, at_rest) if at_rest else _until_not_finite(episode, trips)
+
+
+def _evaluated(
+    function: ca.Function, given: NDArray[np.float64], unknown: NDArray[np.float64], shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    recorded = np.empty(shape)
+    # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.
+    buffer: Any
+    buffer, evaluate = function.buffer()
+    buffer.set_arg(0, given.data)
+    buffer.set_arg(1, unknown.data)
+    buffer.set_res(0, recorded.data)
+    evaluate()
+    return recorded
 
 
 def compiled_episode(controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None) -> CompiledEpisode:

@@ -18,14 +18,17 @@ from chargetune.learning.posterior import Posterior
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin import Twin
 
-__all__ = ["Belief", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
+__all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
 TRACES_MAX = 6
 
 
-Simulate = Callable[[NDArray[np.float64]], Episode | None]
-"""theta -> the episode of one simulated plant, None when it fails."""
+Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
+"""thetas -> the episode of each on one simulated plant, None where it fails."""
+
+Case = tuple[NDArray[np.float64], NDArray[np.float64], OutputError | None]
+"""One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
 
 
 class TracedTrial(TrialLike, Protocol):
@@ -46,11 +49,8 @@ class TwinLoop(EnvelopeLoop, Protocol):
         """Signals of an episode, with their ranges, that the error of the twin depends on."""
         ...
 
-    def simulate(self, theta: NDArray[np.float64], unknowns: NDArray[np.float64], error: OutputError | None = None) -> Episode | None:
-        """A noise-free episode with the controller at theta and the plant at ``unknowns``; None when it fails.
-
-        ``error`` is what the twin cannot represent; it is added to the measured outputs.
-        """
+    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+        """A noise-free episode of each case, None where it fails; the third of a case is added to the measured outputs."""
         ...
 
     def score(self, episode: Episode) -> Score | None:
@@ -76,17 +76,20 @@ class Belief:
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
-        return self.loop.simulate(theta, *self._centre)
+        return self.expected([theta])[0]
+
+    def expected(self, thetas: Sequence[NDArray[np.float64]]) -> list[Episode | None]:
+        """`central` of several thetas."""
+        return self.loop.simulate([(theta, *self._centre) for theta in thetas])
 
     def plant(self, seed: int) -> Simulate:
-        """One plant drawn from the belief: theta -> episode."""
+        """One plant drawn from the belief: thetas -> episodes."""
         ((m, error),) = self._plants(1, seed)
-        return lambda theta: self.loop.simulate(theta, m, error)
+        return lambda thetas: self.loop.simulate([(theta, m, error) for theta in thetas])
 
     def predict(self, theta: NDArray[np.float64], count: int, seed: int) -> Prediction:
         """What ``count`` plants drawn from the belief do; the same plants for the same seed."""
-        episodes = [self.loop.simulate(theta, *plant) for plant in self._plants(count, seed)]
-        return Prediction(self.loop, tuple(episodes))
+        return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in self._plants(count, seed)])))
 
     @cached_property
     def _centre(self) -> tuple[NDArray[np.float64], OutputError | None]:

@@ -102,7 +102,7 @@ class Discrepancy:
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
         at = np.clip(self._at(episode), *np.array(list(self.features.values())).T)
-        spread = np.stack([np.sum(part.root**2, axis=1) for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
+        spread = np.stack([np.maximum(np.diag(part.rest), 0.0) for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
         known = (counts > 0) & np.isfinite(left)
         square, unmodelled, rest = left[known] ** 2, self._table(spread)(at)[known], rest[known]
@@ -168,10 +168,16 @@ class Discrepancy:
 
 @dataclass(frozen=True)
 class _Part:
-    """One output: residuals -> mean at the nodes, and a factor of the covariance at the nodes."""
+    """One output: residuals -> mean at the nodes, and the covariance at the nodes."""
 
     gain: NDArray[np.float64]
-    root: NDArray[np.float64]
+    rest: NDArray[np.float64]
+
+    @cached_property
+    def root(self) -> NDArray[np.float64]:
+        """A factor of the covariance, which neighbouring nodes leave singular to rounding."""
+        values, vectors = np.linalg.eigh((self.rest + self.rest.T) / 2)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _part(
@@ -186,7 +192,7 @@ def _part(
     d = x.shape[1]
     # In units of their prior medians all length scales have the same prior.
     medians = np.array(LENGTH[:d])
-    kernel = MaternKernel(nu=2.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD))
+    kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD))
     model = SingleTaskGP(
         torch.as_tensor(x / medians), torch.as_tensor(left[:, None] / size),
         torch.as_tensor(np.minimum(variance / size**2, 1e6)[:, None]),
@@ -202,9 +208,7 @@ def _part(
     n = len(x)
     seen = cho_factor(whole[:n, :n] + np.diag(variance + JITTER * whole[0, 0]), lower=True)
     gain = cho_solve(seen, whole[:n, n:]).T
-    rest = whole[n:, n:] - gain @ whole[:n, n:]
-    values, vectors = np.linalg.eigh((rest + rest.T) / 2)
-    return _Part(gain, vectors * np.sqrt(np.maximum(values, 0.0)))
+    return _Part(gain, whole[n:, n:] - gain @ whole[:n, n:])
 
 
 def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

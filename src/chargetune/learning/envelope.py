@@ -27,7 +27,7 @@ UNCOVERED = 1e4
 MOVING = 1e-3
 # The rows are linearised at the theta of the episode, and once more at the first solution.
 LINEARISATIONS = 2
-# A row whose limit was never closer than this share of its own spread is not covered.
+# A row of which neither plant nor controller was ever closer to its limit than this share of its spread is not covered.
 REACH = 0.25
 # An input within this share of its range is at its bound.
 AT_BOUND = 1e-3
@@ -151,14 +151,19 @@ def covering(
     Raises ValueError when there is nothing to cover.
     """
     lower, upper = controller.theta.lower, controller.theta.upper
-    near, full = _near(controller, measured), _at_bound(controller, episode, theta)
-    for _ in range(LINEARISATIONS):
-        rows, slopes = predicted_rows(controller, episode, theta)
+    full = _at_bound(controller, episode, theta)
+    rows, slopes = predicted_rows(controller, episode, theta)
+    near = _near(controller, measured, rows)
+    # In units of what is noticed of each limit, kelvin and volt count alike.
+    scale = np.concatenate([np.full(limit.rows.size1_out(0), limit.scale) for limit in controller.limits])
+    for number in range(LINEARISATIONS):
+        if number:
+            rows, slopes = predicted_rows(controller, episode, theta)
         # Where the input is at its bound the limit does not decide it: there the prediction only has to stay below.
         idle = full[:, None, None] & (measured <= 0)
-        wanted = np.where(near, np.where(idle, 0.0, measured) - rows, np.nan).ravel()
+        wanted = np.where(near, (np.where(idle, 0.0, measured) - rows) / scale, np.nan).ravel()
         free = np.broadcast_to(idle, rows.shape).ravel()
-        steep = slopes.reshape(wanted.size, -1)
+        steep = (slopes / scale[:, None]).reshape(wanted.size, -1)
         known = np.isfinite(wanted) & np.all(np.isfinite(steep), axis=1)
         if not known.any():
             raise ValueError("nothing to cover: no measured row is finite")
@@ -180,19 +185,28 @@ def covering(
     return np.asarray(theta, dtype=np.float64)
 
 
-def _near(controller: Controller, measured: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which rows are to be covered: of each limit the closer side, because the other one asks for the opposite."""
+def _near(controller: Controller, measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which rows are to be covered: those of a limit that the plant or, with its backoff, the controller came close to.
+
+    Of each limit the closer side, because the other one asks for the opposite.
+    """
     if not np.any(np.isfinite(measured)):
         raise ValueError("nothing to cover: no measured row is finite")
-    flat = np.where(np.isfinite(measured), measured, -np.inf).reshape(-1, measured.shape[-1])
-    most, least = flat.max(axis=0), np.where(np.isfinite(flat), flat, np.inf).min(axis=0)
-    closeness = np.where(np.isfinite(most), most / np.maximum(np.where(np.isfinite(most), most - least, 1.0), 1e-12), -np.inf)
+    closeness = np.maximum(_closeness(measured), np.where(np.isfinite(measured).any(axis=(0, 1)), _closeness(predicted), -np.inf))
     out, first = closeness >= min(-REACH, float(closeness.max())), 0
     for limit in controller.limits:
         part = slice(first, first + limit.rows.size1_out(0))
         out[part] &= np.arange(part.stop - part.start) == np.argmax(closeness[part])
         first = part.stop
     return out
+
+
+def _closeness(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Largest value of each row as a share of its spread, shape (rows,); -inf where none is finite."""
+    flat = np.where(np.isfinite(rows), rows, np.nan).reshape(-1, rows.shape[-1])
+    known = np.isfinite(flat).any(axis=0)
+    most, least = (pick(np.where(known, flat, 0.0), axis=0) for pick in (np.nanmax, np.nanmin))
+    return np.where(known, most / np.maximum(most - least, 1e-12), -np.inf)
 
 
 def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float64]) -> NDArray[np.bool_]:

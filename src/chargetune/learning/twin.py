@@ -1,7 +1,7 @@
 """Twin: what whole measured traces say of a plant's parameters, as a posterior that can be predicted with and drawn from.
 
-Model: y = h(x, u, p) + discrepancy, x+ = f(x, u, p), p = nominal * exp(m) for factors and nominal + m for offsets, with prior
-m ~ N(0, S). Every measured output at both ends of every interval of every trial is a datum. The posterior is Laplace's: mode by
+Model: y = h(x, u, p) + bias + discrepancy, x+ = f(x, u, p), p = nominal * exp(m) for factors and nominal + m for offsets, with
+prior m ~ N(0, S). Every measured output at both ends of every interval of every trial is a datum. The posterior is Laplace's: mode by
 Gauss-Newton with exact sensitivities from CasADi, covariance (J'J)^-1 of the whitened residuals at the mode.
 Source: MacKay, Neural Computation 4 (1992) 448; Bock, in Modelling of Chemical Reaction Systems (1981) for the least squares.
 """
@@ -39,22 +39,22 @@ FTOL, XTOL = 1e-6, 1e-5
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter block, or a state at the start, that is not known.
+    """A parameter block, a state at the start, or the constant error of a measured output, that is not known.
 
     sd
-        Standard deviation of ln(p / nominal) for a factor, of p - nominal for an offset.
+        Standard deviation of ln(p / nominal) for a factor, of p - nominal for an offset, of what is added to the output for a bias.
     smooth
         Correlation of neighbouring entries of a block: entries i and j have correlation smooth^|i - j|.
     """
 
     name: str
     sd: float
-    kind: Literal["factor", "offset", "start"] = "factor"
+    kind: Literal["factor", "offset", "start", "bias"] = "factor"
     smooth: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("factor", "offset", "start"):
-            raise ValueError(f"twin: kind of {self.name} = {self.kind!r}, allowed is 'factor', 'offset' or 'start'")
+        if self.kind not in ("factor", "offset", "start", "bias"):
+            raise ValueError(f"twin: kind of {self.name} = {self.kind!r}, allowed is 'factor', 'offset', 'start' or 'bias'")
         for name, low, high in (("sd", 0.0, math.inf), ("smooth", 0.0, 1.0)):
             value = getattr(self, name)
             number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
@@ -69,8 +69,8 @@ class Twin:
     ``noise_sd`` maps the measured outputs to the standard deviation of one sample, ``start`` the states at the start of every
     trial to their nominal value (others are 0). ``error_sd`` is by how much at least an output may be off at the largest input
     where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input, down to the
-    share ``error_at_rest`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does. Raises
-    ValueError for what the model does not have.
+    share ``error_at_rest`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does.
+    Raises ValueError for what the model does not have.
     """
 
     model: Model
@@ -82,15 +82,20 @@ class Twin:
 
     def __post_init__(self) -> None:
         model = self.model
-        known = {"start": set(model.state_names), "factor": set(model.parameter_blocks), "offset": set(model.parameter_blocks)}
+        blocks = set(model.parameter_blocks)
+        known = {"start": set(model.state_names), "factor": blocks, "offset": blocks, "bias": set(self.noise_sd)}
         for one in self.unknowns:
             if one.name not in known[one.kind]:
                 raise ValueError(f"twin: unknown {one.kind} {one.name!r}, allowed are {', '.join(sorted(known[one.kind]))}")
-        names = [(one.name, one.kind == "start") for one in self.unknowns]
+        names = [_slot(one) for one in self.unknowns]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"twin: unknowns = {[n for n, _ in names]}, allowed is each once, at least one")
         outputs = tuple(self.noise_sd)
-        named = (("noise_sd", outputs, model.output_names), ("start", self.start, model.state_names), ("error_sd", self.error_sd, outputs))
+        named = (
+            ("noise_sd", outputs, model.output_names),
+            ("start", self.start, model.state_names),
+            ("error_sd", self.error_sd, outputs),
+        )
         for label, given, allowed in named:
             unknown = sorted(set(given) - set(allowed))
             if unknown:
@@ -101,7 +106,7 @@ class Twin:
     @cached_property
     def sizes(self) -> tuple[int, ...]:
         """Entries of each unknown."""
-        return tuple(1 if one.kind == "start" else self.model.parameter_blocks[one.name] for one in self.unknowns)
+        return tuple(1 if one.kind in ("start", "bias") else self.model.parameter_blocks[one.name] for one in self.unknowns)
 
     @cached_property
     def prior_factor(self) -> NDArray[np.float64]:
@@ -124,6 +129,11 @@ class Twin:
         """The state at the start of a trial for unknowns m, shape (nx,)."""
         return np.array(_mapping(_Key(self))[1](m, *_numbers(self))).ravel()
 
+    def biases(self, m: NDArray[np.float64]) -> dict[str, float]:
+        """What is added to measured outputs for unknowns m, by output."""
+        pieces = np.split(np.asarray(m), np.cumsum(self.sizes)[:-1])
+        return {one.name: float(piece[0]) for one, piece in zip(self.unknowns, pieces, strict=True) if one.kind == "bias"}
+
     def predict(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Measured outputs at both ends of every interval under ``inputs`` (K, nu), shape (K, 2, number of measured outputs)."""
         flat = self._roll(0, m, inputs)
@@ -137,7 +147,17 @@ class Twin:
     def _roll(self, which: int, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         length = _padded(len(inputs))
         padded = np.vstack([inputs, np.zeros((length - len(inputs), inputs.shape[1]))])
-        return np.array(_simulated(_Key(self), length)[which](m, *_numbers(self), padded.T))
+        function = _simulated(_Key(self), length)[which]
+        given = [np.ascontiguousarray(part, dtype=float) for part in (m, *_numbers(self), padded)]
+        out = np.empty(function.size_out(0)[::-1])
+        # CasADi reads and writes these arrays in place, by columns: C order of the transposed matrix.
+        buffer: Any
+        buffer, evaluate = function.buffer()
+        for i, part in enumerate(given):
+            buffer.set_arg(i, part.data)
+        buffer.set_res(0, out.data)
+        evaluate()
+        return out.T
 
     def measured(self, episode: Episode) -> NDArray[np.float64]:
         """The measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
@@ -229,27 +249,33 @@ def _numbers(twin: Twin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return twin.model.nominal, np.array([float(twin.start.get(name, 0.0)) for name in twin.model.state_names])
 
 
-def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any]:
-    """(m, nominal parameters, nominal start, p(m), x0(m)) as expressions."""
+def _slot(one: Uncertain) -> tuple[str, str]:
+    """What an unknown belongs to: factor and offset of a block exclude each other."""
+    return one.name, one.kind if one.kind in ("start", "bias") else "block"
+
+
+def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """(m, nominal parameters, nominal start, p(m), x0(m), biases(m) by measured output) as expressions."""
     model = twin.model
     m = ca.SX.sym("m", sum(twin.sizes))
     nominal, begin = ca.SX.sym("nominal", model.nominal.size), ca.SX.sym("begin", len(model.states))
     pieces = ca.vertsplit(m, np.cumsum([0, *twin.sizes]).tolist())
-    parts = {(one.name, one.kind == "start"): piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
-    kinds = {one.name: one.kind for one in twin.unknowns if one.kind != "start"}
+    parts = {_slot(one): piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
+    kinds = {one.name: one.kind for one in twin.unknowns if one.kind in ("factor", "offset")}
     blocks, first = [], 0
     for name, values in model.parameters:
-        block, change = nominal[first : first + len(values)], parts.get((name, False))
+        block, change = nominal[first : first + len(values)], parts.get((name, "block"))
         blocks.append(block if change is None else block * ca.exp(change) if kinds[name] == "factor" else block + change)
         first += len(values)
-    starts = [begin[i] + parts.get((name, True), 0.0) for i, name in enumerate(model.state_names)]
-    return m, nominal, begin, ca.vertcat(*blocks), ca.vertcat(*starts)
+    starts = [begin[i] + parts.get((name, "start"), 0.0) for i, name in enumerate(model.state_names)]
+    bias = [parts.get((name, "bias"), 0.0) for name in twin.noise_sd]
+    return m, nominal, begin, ca.vertcat(*blocks), ca.vertcat(*starts), ca.vertcat(*bias)
 
 
 @lru_cache(maxsize=16)
 def _mapping(key: _Key) -> tuple[ca.Function, ca.Function]:
     """(m, nominal, begin) -> p, and -> x0."""
-    m, nominal, begin, p, x0 = _symbols(key.twin)
+    m, nominal, begin, p, x0, _ = _symbols(key.twin)
     return ca.Function("p", [m, nominal, begin], [p]), ca.Function("x0", [m, nominal, begin], [x0])
 
 
@@ -271,12 +297,12 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     twin = key.twin
     model = twin.model
     nx, nu, d = len(model.states), len(model.inputs), sum(twin.sizes)
-    m, nominal, begin, p, x0 = _symbols(twin)
+    m, nominal, begin, p, x0, bias = _symbols(twin)
     x, u, sensitivity = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("S", nx, d)
     rows = [model.output_names.index(name) for name in twin.noise_sd]
 
     def outputs(state: Any) -> Any:
-        return model.h(state, u, p)[rows]
+        return model.h(state, u, p)[rows] + bias
 
     after, at = model.f(x, u, p), ca.SX.sym("after", nx)
     ahead = ca.mtimes(ca.jacobian(after, x), sensitivity) + ca.jacobian(after, m)

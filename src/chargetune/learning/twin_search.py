@@ -39,17 +39,21 @@ class Search:
         self._unit = (1.0, 1.0)
 
     def score(self, u: NDArray[np.float64]) -> Score | None:
-        key = u.tobytes()
-        if key not in self._seen:
-            episode = self._simulate(self._space.from_unit(np.clip(u, 0.0, 1.0)))
-            self._seen[key] = None if episode is None else self._loop.score(episode)
-        return self._seen[key]
+        return self.scores([u])[0]
+
+    def scores(self, points: Sequence[NDArray[np.float64]]) -> list[Score | None]:
+        """Verdicts at several points, simulated together."""
+        fresh = list({u.tobytes(): u for u in points if u.tobytes() not in self._seen}.values())
+        episodes = self._simulate([self._space.from_unit(np.clip(u, 0.0, 1.0)) for u in fresh]) if fresh else []
+        for u, episode in zip(fresh, episodes, strict=True):
+            self._seen[u.tobytes()] = None if episode is None else self._loop.score(episode)
+        return [self._seen[u.tobytes()] for u in points]
 
     def envelope(self, start: NDArray[np.float64], iterations: int) -> None:
         """From ``start``, ``iterations`` times the theta whose predictions cover what the plant did last; all are remembered."""
         theta = self._space.from_unit(start)
         for _ in range(iterations):
-            episode = self._simulate(theta)
+            episode = self._simulate([theta])[0]
             if episode is None:
                 return
             theta = covering(self._loop.controller, episode, theta, self._loop.measured_rows(episode))
@@ -57,7 +61,7 @@ class Search:
 
     def scale(self, points: Sequence[NDArray[np.float64]]) -> None:
         """Take the units from the spread over these points."""
-        scores = [s for u in points if (s := self.score(u)) is not None]
+        scores = [s for s in self.scores(points) if s is not None]
         objective = [s.objective for s in scores]
         excess = [float(np.nanmax(windows_of(s, AIMED), initial=0.0)) for s in scores]
         self._unit = (float(np.ptp(objective)) or 1.0 if objective else 1.0, max(excess, default=0.0) or 1.0)
@@ -110,10 +114,10 @@ class Search:
         if key not in self._slopes:
             value, excess = self._values(u)
             gradient, jacobian = np.zeros(u.size), np.zeros((excess.size, u.size))
-            for i in range(u.size):
-                step = STEP if u[i] + STEP <= 1.0 else -STEP
-                ahead = u.copy()
-                ahead[i] += step
+            steps = np.where(u + STEP <= 1.0, STEP, -STEP)
+            around = [u + step for step in np.diag(steps)]
+            self.scores(around)
+            for i, (step, ahead) in enumerate(zip(steps, around, strict=True)):
                 other, beyond = self._values(ahead)
                 if np.isfinite(other) and beyond.shape == excess.shape:
                     gradient[i] = (other - value) / step

@@ -99,7 +99,7 @@ class TwinTuner:
         drawn = [belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n)]
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
-        plants = drawn if pending else [belief.central, *drawn[: n - 1]]
+        plants = drawn if pending else [belief.expected, *drawn[: n - 1]]
         thetas = [space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants]
         if pending:
             return np.array(thetas)
@@ -164,7 +164,7 @@ class TwinTuner:
         if score is None:
             return theta
         margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
-        search = Search(self.loop, belief.central, space, np.nan_to_num(margin))
+        search = Search(self.loop, belief.expected, space, np.nan_to_num(margin))
         start = space.to_unit(theta)
         search.scale([start, space.to_unit(space.default)])
         search.refine(start, POLISHING)
