@@ -7,7 +7,7 @@ is at most 1 mV, any other limit kept within its tolerance, and its t95 within 1
 newest theta by the methods that learn from traces (safe, twin, ilc), the best that its processes believe to keep the limits by
 composite, the best that kept them as measured by the others. Attainable: the least t95 with at most 1 mV over the limit that
 envelope steps and SLSQP on the true plant find, computed here and kept in --cache; on a DFN plant envelope steps alone, and t80
-stands for t95 in every key. Where no theta keeps the limit, nothing is solved.
+stands for t95 in every key. Where no theta keeps the limit, nothing is solved. A safe learner that knows no safe theta stops.
 """
 
 from __future__ import annotations
@@ -117,7 +117,11 @@ def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int
         begin = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            theta = tuner.ask(problem.space, told, 1)[0]
+            try:
+                theta = tuner.ask(problem.space, told, 1)[0]
+            except learning.NoSafeThetaError:
+                # It stops here, with what it has.
+                break
         out["ask_s"].append(time.perf_counter() - begin)
         score, episode, ending = problem(theta, 1000 * seed + number)
         status = "done" if score else "failed"
@@ -151,7 +155,7 @@ def rows(runs: list[dict[str, Any]], args: argparse.Namespace, attainable: dict[
     for method in args.methods:
         own = [r for r in runs if r["method"] == method]
         for count in range(1, args.trials + 1):
-            at = [r["recommended"][count - 1] for r in own]
+            at = [r["recommended"][:count][-1] for r in own]
             ratios = [r["t95"][k] / attainable[r["seed"]] for r, k in zip(own, at, strict=True)]
             kept = [r["kept"][k] for r, k in zip(own, at, strict=True)]
             excess = np.concatenate([r["excess_mV"][:count] for r in own])
@@ -164,7 +168,7 @@ def rows(runs: list[dict[str, Any]], args: argparse.Namespace, attainable: dict[
                     "violating_trials": int(np.sum(excess > EXCESS_MV)), "all_trials": len(excess),
                     "worst_excess_mV": float(np.max(excess)), "seeds_beyond_5_mV": far,
                     "worst_excess_K": _worst(own, "excess_K", count), "worst_excess_anode_mV": _worst(own, "excess_anode_mV", count),
-                    "ask_s_median": float(np.median([r["ask_s"][count - 1] for r in own])),
+                    "ask_s_median": float(np.median([r["ask_s"][:count][-1] for r in own])),
                 }
             )  # fmt: skip
     return found

@@ -72,6 +72,19 @@ def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
     assert minutes[-1] < 50.0
 
 
+def test_nothing_is_risked_for_nothing():
+    """The time to 60 % asks nothing of the backoff near full: there the charge stays as careful as it began."""
+    start = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
+    problem = charge(ratios=(), backoff=start, charge_time_to_soc=0.6)
+    trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 4)
+    theta = np.array(trials[-1].theta)
+    assert max(excess) <= 1.0
+    assert theta[10] == 0.3
+    assert theta[9] >= 0.2
+    assert np.all(theta[2:6] < 0.2)
+    assert trials[-1].score.objective > trials[1].score.objective
+
+
 def test_temperature_and_anode_potential_are_kept_while_learning():
     """The learner's anode table is off by 10 mV and a fifth of its resistance, its circuit by up to half of its own."""
     true = replace(

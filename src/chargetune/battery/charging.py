@@ -397,4 +397,6 @@ class ChargingProblem:
 def _by_window(soc: NDArray[np.float64], excess: NDArray[np.float64], windows: int) -> tuple[float | None, ...]:
     """The worst excess in each of ``windows`` equal parts of 0..1 in SOC; None where no interval ended."""
     index = np.clip((soc * windows).astype(int), 0, windows - 1)
-    return tuple(float(np.max(excess[index == i])) if np.any(index == i) else None for i in range(windows))
+    worst = np.full(windows, -np.inf)
+    np.maximum.at(worst, index, excess)
+    return tuple(None if value == -np.inf else float(value) for value in worst)

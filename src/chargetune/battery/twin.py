@@ -30,7 +30,7 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 # A circuit's prediction is off by at least about this where it was not measured.
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
-OCV_SHARE = 0.3
+OCV_SHARE = 1.0
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 

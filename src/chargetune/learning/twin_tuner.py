@@ -41,6 +41,8 @@ CAUTION = 2.5
 WIDER = 1.25
 # Iterations of the search that ends it.
 POLISHING = 8
+# A change of theta that promises less than this share of the objective is not worth a risk.
+GAIN = 1e-3
 # Of a limit's tolerance, what the upper side of the prediction may use.
 AIMED = 0.5
 
@@ -149,11 +151,13 @@ class TwinTuner:
         if not passed:
             return self._tried(trials, belief, safety, seed)
         theta = max(passed, key=lambda one: one[0])[1]
-        if not proved:
-            return theta
-        polished = self._polished(space, belief, theta, belief.predict(theta, DRAWS, seed), deviations)
-        safe = belief.predict(polished, DRAWS, seed).probability() >= safety.probability
-        return polished if safe else theta
+        predicted = belief.predict(theta, DRAWS, seed)
+        if proved:
+            polished = self._polished(space, belief, theta, predicted, deviations)
+            other = belief.predict(polished, DRAWS, seed)
+            theta, predicted = (polished, other) if other.probability() >= safety.probability else (theta, predicted)
+        nearer = self._nearer(space, trials, belief, theta, predicted.upper_windows(deviations))
+        return nearer if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability else theta
 
     def _polished(
         self, space: ParameterSpace, belief: Belief, theta: NDArray[np.float64], predicted: Prediction, deviations: float
@@ -169,6 +173,46 @@ class TwinTuner:
         search.scale([start, space.to_unit(space.default)])
         search.refine(start, POLISHING)
         return space.from_unit(search.best())
+
+    def _nearer(
+        self, space: ParameterSpace, trials: Sequence[TrialLike], belief: Belief, theta: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """``theta`` with every entry back, or half the way back, where it was in the best trial, whose change promises nothing.
+
+        A change is a step into what has not been seen: nothing is risked for nothing. Where no change promises anything it is
+        the theta of the best trial itself. ``upper`` is the upper side of the excess by window at ``theta``; its distance to what is
+        expected there is held on the way.
+        """
+        known = [(t.score.objective, np.array(t.theta)) for t in trials if t.score is not None and t.score.feasible]
+        if not known:
+            return theta
+        best = max(known, key=lambda one: one[0])[1]
+        search = Search(self.loop, belief.expected, space)
+        own = search.score(space.to_unit(theta))
+        if own is None:
+            return theta
+        margin = np.nan_to_num(upper - windows_of(own))
+        most = max(0.0, float(np.nanmax(windows_of(own) + margin)))
+
+        def promised(points: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+            scores = search.scores([space.to_unit(p) for p in points])
+            kept = [s is not None and float(np.nanmax(windows_of(s) + margin)) <= most for s in scores]
+            return np.array([s.objective if s is not None and k else -np.inf for s, k in zip(scores, kept, strict=True)])
+
+        ahead, least = (float(value) for value in promised([best, theta]))
+        least -= GAIN * abs(least)
+        if ahead >= least:
+            return best
+        for share in (1.0, 0.5):
+            single = np.tile(theta, (len(theta), 1))
+            np.fill_diagonal(single, theta + share * (best - theta))
+            # What costs the least goes back first.
+            for i in np.argsort(-promised(list(single))):
+                moved = theta.copy()
+                moved[i] = single[i, i]
+                if moved[i] != theta[i] and promised([moved])[0] >= least:
+                    theta = moved
+        return theta
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Envelope steps on the plant that is expected."""
