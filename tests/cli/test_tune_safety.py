@@ -78,6 +78,22 @@ def test_nonsense_is_refused_by_name(tmp_path, safety, tuner, said):
     assert said in done.stderr
 
 
+def test_what_is_unknown_of_the_plant_is_told_to_the_twin(tmp_path):
+    study = tmp_path / "unknown.toml"
+    example = (Path(__file__).parents[2] / "examples" / "safe_charge.toml").read_text()
+    study.write_text(example + "\n[twin]\ncapacity_spread = 0.03\nsoc_spread = 0.01\nocv_spread_V = 0.003\n")
+    config = load_config(study)
+    problem = config.problem(tmp_path)
+    tuner = make_tuner("twin", 0, problem, None, None, config.twin)
+    assert [(one.name, one.sd) for one in tuner.loop.twin.unknowns[3:]] == [("capacity_Ah", 0.03), ("soc", 0.01), ("voltage_V", 0.003)]
+    assert config.document(tmp_path)["twin"]["soc_spread"] == 0.01
+    with pytest.raises(ValueError, match=r"\[twin\] is given with tuner = 'sobol'"):
+        make_tuner("sobol", 0, problem, None, None, config.twin)
+    study.write_text(study.read_text().replace("soc_spread = 0.01", "soc_spread = -0.01"))
+    with pytest.raises(ValueError, match=r"twin.soc_spread = -0\.01"):
+        load_config(study)
+
+
 def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
     study = tmp_path / "plated.toml"
     example = Path(__file__).parents[2] / "examples"

@@ -223,6 +223,18 @@ class SafetyTable(_Table):
     abort_margin_K: float | None = 2.0
 
 
+class TwinTable(_Table):
+    """What is unknown of the plant before the first trial, as standard deviations: for the tuner "twin".
+
+    ``resistance_spread`` is that of the logarithm of every R and C, ``capacity_spread`` relative, 0 is known exactly.
+    """
+
+    resistance_spread: float = Field(default=0.4, gt=0.0, le=2.0)
+    capacity_spread: float = Field(default=0.0, ge=0.0, le=0.3)
+    soc_spread: float = Field(default=0.0, ge=0.0, le=0.3)
+    ocv_spread_V: float = Field(default=0.0, ge=0.0, le=0.1)
+
+
 class Config(_Table):
     """The whole file; every table may be left out."""
 
@@ -237,6 +249,7 @@ class Config(_Table):
     objective: ObjectiveTable = ObjectiveTable()
     theta: ThetaTable = ThetaTable()
     safety: SafetyTable | None = None
+    twin: TwinTable | None = None
 
     def problem(self, folder: Path | None = None, *, cell: Cell | None = None) -> ChargingProblem:
         """The charging problem; a relative cell file is looked for in ``folder``, ``cell`` stands in for the file's.
@@ -302,8 +315,9 @@ class Config(_Table):
         # What is not given leaves no entry, that studies of before it resume.
         if self.objective.charge_time_to_soc is None:
             del data["objective"]["charge_time_to_soc"]
-        if self.safety is None:
-            del data["safety"]
+        for name in ("safety", "twin"):
+            if data[name] is None:
+                del data[name]
         return data
 
     def _cell(self, folder: Path | None) -> Cell:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.claims import SeedRun, decide
-from chargetune.battery.config import CASE_STUDIES, Config, SafetyTable, TunerName, case_study, problem_of_document
+from chargetune.battery.config import CASE_STUDIES, Config, SafetyTable, TunerName, TwinTable, case_study, problem_of_document
 from chargetune.battery.twin import ChargingTwin
 from chargetune.battery.windows import ChargingWindows
 from chargetune.episode.episode import Episode
@@ -31,7 +31,12 @@ ATTAINABLE_T95_MIN: dict[str, tuple[float, ...]] = {
 
 
 def make_tuner(
-    name: TunerName, seed: int, problem: ChargingProblem, safety: SafetyTable | None = None, start: NDArray[np.float64] | None = None
+    name: TunerName,
+    seed: int,
+    problem: ChargingProblem,
+    safety: SafetyTable | None = None,
+    start: NDArray[np.float64] | None = None,
+    unknown: TwinTable | None = None,
 ) -> Proposer:
     """The tuner that a configuration names; the twin simulates the problem's controller.
 
@@ -39,10 +44,19 @@ def make_tuner(
     """
     if safety and name != "twin":
         raise ValueError(f"[safety] is given with tuner = {name!r}, allowed is tuner = 'twin': it alone predicts what it has not tried")
+    if unknown and name != "twin":
+        raise ValueError(f"[twin] is given with tuner = {name!r}, allowed is tuner = 'twin': the others have no model of the plant")
     # torch is needed from here on only.
     from chargetune import learning
 
-    twin = ChargingTwin(problem)
+    known = unknown or TwinTable()
+    twin = ChargingTwin(
+        problem,
+        spread=known.resistance_spread,
+        capacity_spread=known.capacity_spread,
+        soc_spread=known.soc_spread,
+        ocv_spread_V=known.ocv_spread_V,
+    )
     if safety and twin.unpredicted:
         raise ValueError(
             f"[safety] is given with the limits {', '.join(twin.unpredicted)}, which the cell's circuit does not predict: "
@@ -69,7 +83,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         config.study.name,
         config=config.document(folder),
         space=problem.space,
-        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem)),
+        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem), config.twin),
         seed=config.study.seed,
         batch=config.study.batch,
         earlier=config.earlier(folder),
