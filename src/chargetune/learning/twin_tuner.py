@@ -43,6 +43,8 @@ WIDER = 1.25
 POLISHING = 8
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
+# Runs of neighbouring entries that go back, one after the other.
+BACKS = 3
 # Of a limit's tolerance, what the upper side of the prediction may use.
 AIMED = 0.5
 
@@ -177,16 +179,16 @@ class TwinTuner:
     def _nearer(
         self, space: ParameterSpace, trials: Sequence[TrialLike], belief: Belief, theta: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """``theta`` with every entry back, or half the way back, where it was in the best trial, whose change promises nothing.
+        """``theta`` with all entries back, or half the way back, where they were in the best trial, whose change promises nothing.
 
         A change is a step into what has not been seen: nothing is risked for nothing. Where no change promises anything it is
         the theta of the best trial itself. ``upper`` is the upper side of the excess by window at ``theta``; its distance to what is
         expected there is held on the way.
         """
-        known = [(t.score.objective, np.array(t.theta)) for t in trials if t.score is not None and t.score.feasible]
+        known = _kept(trials)
         if not known:
             return theta
-        best = max(known, key=lambda one: one[0])[1]
+        best = known[0]
         search = Search(self.loop, belief.expected, space)
         own = search.score(space.to_unit(theta))
         if own is None:
@@ -203,15 +205,16 @@ class TwinTuner:
         least -= GAIN * abs(least)
         if ahead >= least:
             return best
+        # Neighbours go back together: they are nodes of one curve, and one alone would bend it.
+        runs = [(i, j) for i in range(len(theta)) for j in range(i + 1, len(theta) + 1)]
         for share in (1.0, 0.5):
-            single = np.tile(theta, (len(theta), 1))
-            np.fill_diagonal(single, theta + share * (best - theta))
-            # What costs the least goes back first.
-            for i in np.argsort(-promised(list(single))):
-                moved = theta.copy()
-                moved[i] = single[i, i]
-                if moved[i] != theta[i] and promised([moved])[0] >= least:
-                    theta = moved
+            for _ in range(BACKS):
+                moved = [np.concatenate([theta[:i], (theta + share * (best - theta))[i:j], theta[j:]]) for i, j in runs]
+                way = np.array([np.sum(np.abs(one - theta) / (space.upper - space.lower)) for one in moved])
+                way[promised(moved) < least] = 0.0
+                if not np.any(way > 0):
+                    break
+                theta = moved[int(np.argmax(way))]
         return theta
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -225,8 +228,7 @@ class TwinTuner:
 
     def _tried(self, trials: Sequence[TrialLike], belief: Belief, safety: Safety, seed: int) -> NDArray[np.float64]:
         """The best theta that was tried, kept the limits, and is still predicted to."""
-        known = [(t.score.objective, np.array(t.theta)) for t in trials if t.score is not None and t.score.feasible]
-        for _, theta in sorted(known, key=lambda one: -one[0]):
+        for theta in _kept(trials):
             if belief.predict(theta, DRAWS, seed).probability() >= safety.probability:
                 warnings.warn("no safe improvement is known: a theta that was tried is proposed again", RuntimeWarning, stacklevel=2)
                 return theta
@@ -255,3 +257,9 @@ class TwinTuner:
                 f"(the most cautious one: {chances[at]:.2f}); declare a start that does"
             )
         return space.from_unit(corners[at])
+
+
+def _kept(trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
+    """The thetas that kept every limit as measured, the best first."""
+    known = [(t.score.objective, np.array(t.theta)) for t in trials if t.score is not None and t.score.feasible]
+    return [theta for _, theta in sorted(known, key=lambda one: -one[0])]
