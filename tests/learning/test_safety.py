@@ -79,8 +79,7 @@ def test_nothing_is_risked_for_nothing():
     trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 4)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
-    assert theta[10] == 0.3
-    assert theta[9] >= 0.2
+    assert np.all(theta[9:] > 0.2)
     assert np.all(theta[2:6] < 0.2)
     assert trials[-1].score.objective > trials[1].score.objective
 

@@ -158,8 +158,11 @@ class TwinTuner:
             polished = self._polished(space, belief, theta, predicted, deviations)
             other = belief.predict(polished, DRAWS, seed)
             theta, predicted = (polished, other) if other.probability() >= safety.probability else (theta, predicted)
-        nearer = self._nearer(space, trials, belief, theta, predicted.upper_windows(deviations))
-        return nearer if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability else theta
+        for shares in ((1.0, 0.5), (0.5,), (0.25,)):
+            nearer = self._nearer(space, trials, belief, theta, predicted.upper_windows(deviations), shares)
+            if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability:
+                return nearer
+        return theta
 
     def _polished(
         self, space: ParameterSpace, belief: Belief, theta: NDArray[np.float64], predicted: Prediction, deviations: float
@@ -177,9 +180,15 @@ class TwinTuner:
         return space.from_unit(search.best())
 
     def _nearer(
-        self, space: ParameterSpace, trials: Sequence[TrialLike], belief: Belief, theta: NDArray[np.float64], upper: NDArray[np.float64]
+        self,
+        space: ParameterSpace,
+        trials: Sequence[TrialLike],
+        belief: Belief,
+        theta: NDArray[np.float64],
+        upper: NDArray[np.float64],
+        shares: tuple[float, ...],
     ) -> NDArray[np.float64]:
-        """``theta`` with all entries back, or half the way back, where they were in the best trial, whose change promises nothing.
+        """``theta`` with all entries whose change promises nothing moved back by these shares to where they were in the best trial.
 
         A change is a step into what has not been seen: nothing is risked for nothing. Where no change promises anything it is
         the theta of the best trial itself. ``upper`` is the upper side of the excess by window at ``theta``; its distance to what is
@@ -203,11 +212,11 @@ class TwinTuner:
 
         ahead, least = (float(value) for value in promised([best, theta]))
         least -= GAIN * abs(least)
-        if ahead >= least:
+        if ahead >= least and shares[0] == 1.0:
             return best
         # Neighbours go back together: they are nodes of one curve, and one alone would bend it.
         runs = [(i, j) for i in range(len(theta)) for j in range(i + 1, len(theta) + 1)]
-        for share in (1.0, 0.5):
+        for share in shares:
             for _ in range(BACKS):
                 moved = [np.concatenate([theta[:i], (theta + share * (best - theta))[i:j], theta[j:]]) for i, j in runs]
                 way = np.array([np.sum(np.abs(one - theta) / (space.upper - space.lower)) for one in moved])
