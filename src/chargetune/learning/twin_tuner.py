@@ -36,7 +36,7 @@ TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.5
 # Standard deviations that are taken back where nothing is promised; half of the plants would break a limit otherwise.
-CAUTION = 2.5
+CAUTION = 2.0
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
 # Iterations of the search that ends it.
