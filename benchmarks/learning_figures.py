@@ -76,7 +76,7 @@ def _panel(upper: Any, lower: Any, group: list[dict[str, Any]]) -> None:
         lower.plot(trials, [max(0.0, r["worst_excess_mV"]) for r in part], label=method, markersize=3, **look)
     upper.set_ylim(-4, 104)
     lower.set_yscale("symlog", linthresh=1.0)
-    lower.set_ylim(-0.2, 400)
+    lower.set_ylim(-0.2, 600)
     lower.set_yticks([0, 1, 10, 100], ["0", "1", "10", "100"])
     lower.axhline(1.0, color=GREY, linewidth=0.6, zorder=0)
     for ax in (upper, lower):
