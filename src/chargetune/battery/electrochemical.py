@@ -6,6 +6,10 @@ The only module that imports pybamm, and only when a plant is made.
 from __future__ import annotations
 
 import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -196,12 +200,33 @@ class _Built:
         inputs = {CURRENT: -current_A}
         try:
             # Saving every step would make an hour quadratic in the number of intervals.
-            solution = self.solver.step(before, self.model, seconds, inputs=inputs, save=False)
+            with _signals_after():
+                solution = self.solver.step(before, self.model, seconds, inputs=inputs, save=False)
+                states = solution.all_ys[-1]
+                ends = np.array(self.read(states[:, [0, -1]], -current_A))
         except pybamm.SolverError as error:
             raise PlantError(f"PyBaMM's solver failed at {current_A:.4g} A: {str(error).splitlines()[0]}") from error
-        states = solution.all_ys[-1]
-        ends = np.array(self.read(states[:, [0, -1]], -current_A))
         return solution, ends[:, 0], ends[:, 1]
+
+
+@contextmanager
+def _signals_after() -> Iterator[None]:
+    """Signals that Python code handles wait for the end: compiled code loses what a handler raises inside of it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    waiting: list[tuple[int, Any]] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    own = {number: handler for number, handler in handlers.items() if callable(handler)}
+    try:
+        for number in own:
+            signal.signal(number, lambda number, frame: waiting.append((number, frame)))
+        yield
+    finally:
+        for number, handler in own.items():
+            signal.signal(number, handler)
+        for came, frame in waiting[:1]:
+            own[signal.Signals(came)](came, frame)
 
 
 @lru_cache(maxsize=8)
