@@ -1,7 +1,9 @@
 """The electrochemical plant against PyBaMM's own simulation, charge counting and itself."""
 
 import json
+import os
 import pickle
+import signal
 import time
 from dataclasses import replace
 
@@ -11,7 +13,7 @@ from bpx_cell import CELL
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.electrochemical import CellState, Electrochemical
+from chargetune.battery.electrochemical import CellState, Electrochemical, _signals_after
 from chargetune.episode.episode import Ending
 from chargetune.plants.plant import PlantError
 from chargetune.plants.sensors import Sensors
@@ -206,3 +208,21 @@ def test_a_bpx_file(tmp_path):
     path.write_text(json.dumps({**CELL, "Header": {}}))
     with pytest.raises(ValueError, match=r"cell\.json is no BPX file"):
         _ = Electrochemical(parameters=str(path), model="SPM").capacity_Ah
+
+
+def test_a_signal_inside_the_solver_is_handled_after_it():
+    """Compiled code drops what a handler raises inside of it; a failure of the solver does not hide the signal either."""
+    handler, done = signal.getsignal(signal.SIGINT), []
+
+    def interrupted(*, failing):
+        with _signals_after():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append("went on")
+            if failing:
+                raise PlantError("the solver failed")
+
+    for failing in (False, True):
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(failing=failing)
+    assert done == ["went on", "went on"]
+    assert signal.getsignal(signal.SIGINT) is handler

@@ -33,8 +33,6 @@ __all__ = ["Backoff", "ChargingProblem", "PlantModel", "ResistanceRatio"]
 
 # A violation of a limit that is noticed, in its unit: the solver's tolerance is relative to it.
 NOTICED = {"voltage": 0.1, "temperature": 1.0, "anode": 0.01}
-
-
 # The largest of some hundred means is that many standard deviations above the truth.
 NOISE_SD = 3.0
 
