@@ -12,7 +12,7 @@ from botorch.acquisition.analytic import LogConstrainedExpectedImprovement, LogE
 from botorch.models import ModelListGP
 
 from chargetune.episode.score import Score
-from chargetune.learning.constrained import _ExpectedImprovement, _marginals, limits_of
+from chargetune.learning.constrained import _ExpectedImprovement, limits_of, marginals
 from chargetune.learning.expected_improvement import expected_improvement
 from chargetune.learning.failures import RADIUS, AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
@@ -54,7 +54,7 @@ def test_quick_marginals_and_acquisition_are_those_of_the_general_way(standardis
         surrogate = GaussianProcess(standardise=standardise)
         model = ModelListGP(surrogate.fit(X, Y[:, :2]), surrogate.fit(X[:9], Y[:9, 2]))
         found = model.posterior(NEW)
-        mean, sd = _marginals(model, NEW)
+        mean, sd = marginals(model, NEW)
         np.testing.assert_allclose(mean.detach(), found.mean[:, 0].detach(), atol=1e-10)
         np.testing.assert_allclose(sd.detach(), found.variance[:, 0].sqrt().detach(), atol=1e-8)
         arguments = (model, 0.5, 0, {1: (None, 0.1), 2: (None, 0.0)})

@@ -82,6 +82,13 @@ class Belief:
         """`central` of several thetas."""
         return self.loop.simulate([(theta, *self._centre) for theta in thetas])
 
+    def scores(self, thetas: Sequence[NDArray[np.float64]]) -> list[Score | None]:
+        """Verdicts on the episodes expected of several thetas; None where there is no episode or it has none."""
+        fresh = [theta for theta in thetas if theta.tobytes() not in self._scored]
+        for theta, episode in zip(fresh, self.expected(fresh) if fresh else [], strict=True):
+            self._scored[theta.tobytes()] = None if episode is None else self.loop.score(episode)
+        return [self._scored[theta.tobytes()] for theta in thetas]
+
     def plant(self, seed: int) -> Simulate:
         """One plant drawn from the belief: thetas -> episodes."""
         ((m, error),) = self._plants(1, seed)
@@ -106,6 +113,10 @@ class Belief:
         return self._drawn[count, seed]
 
     @cached_property
+    def _scored(self) -> dict[bytes, Score | None]:
+        return {}
+
+    @cached_property
     def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], OutputError | None]]]:
         return {}
 
@@ -118,10 +129,15 @@ class Prediction:
     episodes: tuple[Episode | None, ...]
 
     @cached_property
+    def scores(self) -> list[Score]:
+        """Verdicts on those episodes that have one."""
+        scores = (self.loop.score(e) for e in self.episodes if e is not None)
+        return [score for score in scores if score is not None]
+
+    @cached_property
     def excess(self) -> NDArray[np.float64]:
         """Excess less tolerance by plant and window, in tolerances, shape (plants, windows); nan where none was visited."""
-        scores = (self.loop.score(e) for e in self.episodes if e is not None)
-        rows = [windows_of(score) for score in scores if score is not None]
+        rows = [windows_of(score) for score in self.scores]
         return np.array(rows).reshape(len(rows), -1)
 
     def probability(self) -> float:

@@ -22,7 +22,7 @@ from chargetune.learning.surrogate import GaussianProcess
 from chargetune.learning.tuner import TrialLike, check_count, initial_design
 from chargetune.model.parameters import ParameterSpace
 
-__all__ = ["ConstrainedLogEI", "Limit", "limits_of"]
+__all__ = ["ConstrainedLogEI", "Limit", "limits_of", "marginals"]
 
 SAMPLES = 128
 # asinh(excess / scale) is linear near the limit, where the optimum lies, and logarithmic far away.
@@ -162,7 +162,7 @@ class _Models:
         )
 
 
-def _marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and sd of each output at single points x (b, 1, d), shapes (b, m); the same as from ``model.posterior``.
 
     The surrogates are independent, so their joint covariance, which the general way builds, is not needed: 6 times quicker.
@@ -182,17 +182,17 @@ def _marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 
 
 class _ExpectedImprovement(LogConstrainedExpectedImprovement):
-    """BoTorch's acquisition with `_marginals`."""
+    """BoTorch's acquisition with `marginals`."""
 
     def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
-        return _marginals(self.model, X)
+        return marginals(self.model, X)
 
 
 class _ProbabilityOfFeasibility(LogProbabilityOfFeasibility):
-    """BoTorch's acquisition with `_marginals`."""
+    """BoTorch's acquisition with `marginals`."""
 
     def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
-        return _marginals(self.model, X)
+        return marginals(self.model, X)
 
 
 def _first(samples: torch.Tensor, X: torch.Tensor | None = None) -> torch.Tensor:  # noqa: ARG001 - the signature BoTorch calls

@@ -29,12 +29,21 @@ FAR = -1.0
 class Search:
     """Verdicts on the episodes of one plant by point of the unit cube, remembered.
 
-    ``margin`` is added to the excess of each window, in tolerances.
+    ``margin`` is added to the excess of each window, in tolerances. ``known``: the verdicts that
+    another search on the same plant knows, shared with it; they are looked up and are none of this search's own points.
     """
 
-    def __init__(self, loop: TwinLoop, simulate: Simulate, space: ParameterSpace, margin: NDArray[np.float64] | float = 0.0) -> None:
+    def __init__(
+        self,
+        loop: TwinLoop,
+        simulate: Simulate,
+        space: ParameterSpace,
+        margin: NDArray[np.float64] | float = 0.0,
+        known: dict[bytes, Score | None] | None = None,
+    ) -> None:
         self._loop, self._simulate, self._space, self._margin = loop, simulate, space, margin
         self._seen: dict[bytes, Score | None] = {}
+        self.known: dict[bytes, Score | None] = {} if known is None else known
         self._slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._unit = (1.0, 1.0)
 
@@ -43,11 +52,12 @@ class Search:
 
     def scores(self, points: Sequence[NDArray[np.float64]]) -> list[Score | None]:
         """Verdicts at several points, simulated together."""
-        fresh = list({u.tobytes(): u for u in points if u.tobytes() not in self._seen}.values())
+        fresh = list({u.tobytes(): u for u in points if u.tobytes() not in self.known}.values())
         episodes = self._simulate([self._space.from_unit(np.clip(u, 0.0, 1.0)) for u in fresh]) if fresh else []
         for u, episode in zip(fresh, episodes, strict=True):
-            self._seen[u.tobytes()] = None if episode is None else self._loop.score(episode)
-        return [self._seen[u.tobytes()] for u in points]
+            self.known[u.tobytes()] = None if episode is None else self._loop.score(episode)
+        self._seen |= {u.tobytes(): self.known[u.tobytes()] for u in points}
+        return [self.known[u.tobytes()] for u in points]
 
     def envelope(self, start: NDArray[np.float64], iterations: int) -> None:
         """From ``start``, ``iterations`` times the theta whose predictions cover what the plant did last; all are remembered."""

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
+from chargetune.episode.score import Score
 from chargetune.learning.belief import Belief, Prediction, TwinLoop, believe, episodes_of, windows_of
 from chargetune.learning.constrained import ConstrainedLogEI
+from chargetune.learning.corrected import Candidate, most_promising
 from chargetune.learning.envelope import covering
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
@@ -35,8 +37,9 @@ SETTLED = 2e-3
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.5
-# Standard deviations that are taken back where nothing is promised; half of the plants would break a limit otherwise.
-CAUTION = 2.0
+# Standard deviations that may be taken back where nothing is promised, the first unless the acquisition prefers another. With none
+# half of the plants would break a limit, with one every fortieth trial did by more than 1 mV.
+CAUTION = (2.0, 3.0)
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
 # Iterations of the search that ends it.
@@ -53,20 +56,21 @@ AIMED = 0.5
 class TwinTuner:
     """First theta_0; then the theta that is best on the plant as the traces so far show it.
 
-    Each theta solves max objective s.t. excess <= tolerance, in every window where the score has a profile, on the
-    simulated closed loop with the twin at its posterior mode plus the mean discrepancy (`Search`), from the ``starts`` best of
-    ``pool`` Sobol points, theta_0 and the thetas tried so far, and from the theta tried last. Further thetas of a batch, and
-    those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same thetas.
-    Without a single trace the design is Sobol's.
+    Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). Candidates solve max objective s.t.
+    excess + sd <= tolerance, in every window where the score has a profile, on the simulated closed loop with the twin at its
+    posterior mode plus the mean discrepancy (`Search`), for several sd of an ensemble (`CAUTION`); searched from theta_0, ``pool``
+    Sobol points and the thetas tried so far. Constrained log expected improvement, on m corrected by the Gaussian process of what the
+    trials left of it, picks one (`most_promising`). Further thetas of a batch, and those proposed beside running trials, are best
+    on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
 
     With ``safety`` the theta is one whose controller predicts the upper side of the belief: envelope steps (`covering`) on mean
-    plus some sd of an ensemble of plants. Proposed is the best one that keeps every limit on a share of the ensemble of at least
-    the stated probability; the first theta is the declared start, or the most cautious corner. Where no such theta is found
-    the best one tried that is still predicted to be safe is proposed again, with a warning; where there is none, or the budget of
-    violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant.
+    plus some sd of an ensemble of plants. Candidates are those that keep every limit on a share of the ensemble of at least the
+    stated probability, and the same acquisition picks; the first theta is the declared start, or the most cautious corner. Where
+    no such theta is found the best one tried that is still predicted to be safe is proposed again, with a warning; where there is
+    none, or the budget of violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant.
     """
 
     loop: TwinLoop
@@ -104,11 +108,16 @@ class TwinTuner:
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
         plants = drawn if pending else [belief.expected, *drawn[: n - 1]]
-        thetas = [space.from_unit(self._searched(Search(self.loop, plant, space), first).best()) for plant in plants]
+        searches = [self._searched(Search(self.loop, plant, space), first) for plant in plants]
+        thetas = [space.from_unit(search.best()) for search in searches]
         if pending:
             return np.array(thetas)
-        predicted = belief.predict(thetas[0], DRAWS, self.seed + 7919 * len(trials))
-        return np.array([self._polished(space, belief, thetas[0], predicted, CAUTION), *thetas[1:]])
+        seed = self.seed + 7919 * len(trials)
+        predicted = belief.predict(thetas[0], DRAWS, seed)
+        cautious = [self._polished(space, belief, thetas[0], predicted, sd, searches[0].known) for sd in CAUTION]
+        candidates = [(theta, belief.predict(theta, DRAWS, seed)) for theta in cautious]
+        best, _ = most_promising(belief, space, trials, candidates, seed)
+        return np.array([best, *thetas[1:]])
 
     def _points(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
         """Where a search may begin: theta_0, Sobol's points, the thetas tried so far, the last one last."""
@@ -134,7 +143,8 @@ class TwinTuner:
         proved = len(belief.discrepancy.episodes) > 1
         deviations = float(norm.ppf(safety.probability)) + (TOGETHER if proved else TOGETHER + UNPROVED)
         # What the plant would allow if the belief were true: from there on caution only takes back.
-        theta, passed = self._covered(belief, np.array(trials[-1].theta)), []
+        theta = self._covered(belief, np.array(trials[-1].theta))
+        passed: list[tuple[float, Candidate]] = []
         for k in range(ROUNDS):
             expected, predicted = belief.central(theta), belief.predict(theta, DRAWS, seed)
             score = None if expected is None else self.loop.score(expected)
@@ -142,7 +152,7 @@ class TwinTuner:
             if expected is None or score is None or rows is None:
                 break
             if predicted.probability() >= safety.probability:
-                passed.append((score.objective, theta))
+                passed.append((score.objective, (theta, predicted)))
             elif k > 1:
                 deviations *= WIDER
             following = covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
@@ -152,12 +162,13 @@ class TwinTuner:
                 break
         if not passed:
             return self._tried(trials, belief, safety, seed)
-        theta = max(passed, key=lambda one: one[0])[1]
-        predicted = belief.predict(theta, DRAWS, seed)
+        candidates = [one for _, one in sorted(passed, key=lambda one: -one[0])]
         if proved:
-            polished = self._polished(space, belief, theta, predicted, deviations)
-            other = belief.predict(polished, DRAWS, seed)
-            theta, predicted = (polished, other) if other.probability() >= safety.probability else (theta, predicted)
+            polished = self._polished(space, belief, *candidates[0], deviations)
+            predicted = belief.predict(polished, DRAWS, seed)
+            if predicted.probability() >= safety.probability:
+                candidates.insert(0, (polished, predicted))
+        theta, predicted = most_promising(belief, space, trials, candidates, seed)
         for shares in ((1.0, 0.5), (0.5,), (0.25,)):
             nearer = self._nearer(space, trials, belief, theta, predicted.upper_windows(deviations), shares)
             if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability:
@@ -165,7 +176,13 @@ class TwinTuner:
         return theta
 
     def _polished(
-        self, space: ParameterSpace, belief: Belief, theta: NDArray[np.float64], predicted: Prediction, deviations: float
+        self,
+        space: ParameterSpace,
+        belief: Belief,
+        theta: NDArray[np.float64],
+        predicted: Prediction,
+        deviations: float,
+        known: dict[bytes, Score | None] | None = None,
     ) -> NDArray[np.float64]:
         """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
         expected = belief.central(theta)
@@ -173,7 +190,7 @@ class TwinTuner:
         if score is None:
             return theta
         margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
-        search = Search(self.loop, belief.expected, space, np.nan_to_num(margin))
+        search = Search(self.loop, belief.expected, space, np.nan_to_num(margin), known)
         start = space.to_unit(theta)
         search.scale([start, space.to_unit(space.default)])
         search.refine(start, POLISHING)

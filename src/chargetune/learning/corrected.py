@@ -1,0 +1,132 @@
+"""The twin's prediction of the score as the prior mean of Algorithm 1; a Gaussian process learns what remains of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from botorch.acquisition.acquisition import AcquisitionFunction
+from botorch.acquisition.analytic import LogConstrainedExpectedImprovement, LogExpectedImprovement, LogProbabilityOfFeasibility
+from botorch.models.model import Model
+from botorch.models.model_list_gp_regression import ModelListGP
+from botorch.posteriors.gpytorch import GPyTorchPosterior
+from gpytorch.distributions import MultitaskMultivariateNormal
+from gpytorch.means import Mean
+from linear_operator.operators import DiagLinearOperator
+from numpy.typing import NDArray
+
+from chargetune.episode.score import Score
+from chargetune.learning.belief import Belief, Prediction
+from chargetune.learning.constrained import marginals
+from chargetune.learning.failures import AwayFromFailures
+from chargetune.learning.search import reproducible
+from chargetune.learning.surrogate import GaussianProcess
+from chargetune.learning.tuner import TrialLike
+from chargetune.model.parameters import ParameterSpace
+
+__all__ = ["Candidate", "most_promising"]
+
+Candidate = tuple[NDArray[np.float64], Prediction]
+"""A theta and what the ensemble of plants does with it."""
+
+# One trial says nothing of what remains.
+PROVED = 2
+# Of a value: a twin that foretold every score to the last digit leaves nothing to be scaled by.
+LEAST = 1e-9
+
+
+def most_promising(
+    belief: Belief, space: ParameterSpace, trials: Sequence[TrialLike], candidates: Sequence[Candidate], seed: int
+) -> Candidate:
+    """The candidate of the largest constrained log expected improvement on the corrected prediction, the earlier of equals.
+
+    For the objective and for the worst excess of every limit, y(theta) = m(theta) + f(theta) + noise, where m is the score of the
+    expected episode (`Belief.central`), f ~ GP(0, s^2 k) with s the rms of y - m over the trials and k as in `GaussianProcess`; the
+    variance at a candidate is that of f plus that of the ensemble. Improvement is over the best trial that kept the limits as
+    measured; while there is none, the probability of keeping them decides. Near failed trials it is lower (`AwayFromFailures`).
+    Candidates of which nothing is foretold are passed over. With fewer than `PROVED` trials the first of them is returned: a twin
+    reproduces the trial that it was made from. Source of the acquisition: Ament et al., NeurIPS 2023.
+    """
+    seen = [t for t in trials if t.score is not None]
+    foretold = belief.scores([*(theta for theta, _ in candidates), *(np.array(t.theta) for t in seen)])
+    known = [(c, s) for c, s in zip(candidates, foretold, strict=False) if s is not None and c[1].scores]
+    done = [(t, s) for t, s in zip(seen, foretold[len(candidates) :], strict=True) if s is not None]
+    if len(known) < 2 or len(done) < PROVED:
+        return known[0][0] if known else candidates[0]
+    failed = [t.theta for t in trials if t.score is None and t.status != "running"]
+    with reproducible(seed):
+        model = _Corrected(space, done, known)
+        away = torch.as_tensor(space.to_unit(np.array(failed).reshape(-1, space.dimension)))
+        points = torch.as_tensor(space.to_unit(np.array([theta for (theta, _), _ in known])))
+        with torch.no_grad():
+            values = AwayFromFailures(model.acquisition(), away)(points[:, None, :])
+        return known[int(torch.nan_to_num(values, nan=-torch.inf).argmax())][0]
+
+
+class _Corrected(Model):
+    """Outputs: the objective, then the excess of each limit less its tolerance, each in units of its own s.
+
+    Known at the thetas of the trials and of the candidates, nowhere else.
+    """
+
+    def __init__(self, space: ParameterSpace, done: Sequence[tuple[TrialLike, Score]], known: Sequence[tuple[Candidate, Score]]) -> None:
+        super().__init__()
+        scores = [t.score for t, _ in done if t.score is not None]
+        measured = np.array([_values(s) for s in scores])
+        foretold = np.array([_values(s) for _, s in (*done, *known)])
+        scale = np.sqrt(np.mean((measured - foretold[: len(done)]) ** 2, axis=0))
+        scale = np.maximum(scale, LEAST * np.max(np.abs(foretold), axis=0)) + np.finfo(float).tiny
+        points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for (theta, _), _ in known)]))
+        x, y = torch.as_tensor(points[: len(done)]), torch.as_tensor(measured / scale)
+        self._model = ModelListGP(
+            *(GaussianProcess(mean=_table(points, foretold[:, i] / scale[i]), standardise=False).fit(x, y[:, i]) for i in range(len(scale)))
+        )
+        spread = np.array([np.std([_values(s) for s in c[1].scores], axis=0) for c, _ in known])
+        self._spread = [_table(points[len(done) :], spread[:, i] / scale[i])() for i in range(len(scale))]
+        kept = [s.objective for s in scores if s.feasible]
+        self._best = max(kept) / scale[0] if kept else None
+
+    @property
+    def num_outputs(self) -> int:
+        return len(self._spread)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        return torch.Size()
+
+    def posterior(self, X: torch.Tensor, *_: Any, **__: Any) -> GPyTorchPosterior:
+        """At single points X (b, 1, d); the outputs are independent."""
+        mean, sd = marginals(self._model, X)
+        spread = torch.stack([part(X)[..., 0] for part in self._spread], dim=-1)
+        return GPyTorchPosterior(MultitaskMultivariateNormal(mean[..., None, :], DiagLinearOperator(sd**2 + spread**2)))
+
+    def acquisition(self) -> AcquisitionFunction:
+        limits: dict[int, tuple[float | None, float | None]] = dict.fromkeys(range(1, self.num_outputs), (None, 0.0))
+        if self._best is None:
+            return LogProbabilityOfFeasibility(self, limits)
+        if not limits:
+            return LogExpectedImprovement(self, self._best)
+        return LogConstrainedExpectedImprovement(self, self._best, 0, limits)
+
+
+def _values(score: Score) -> list[float]:
+    return [score.objective, *(worst - score.tolerance.get(name, 0.0) for name, worst in score.excess.items())]
+
+
+class _Table(Mean):  # type: ignore[misc] # gpytorch has no types
+    """A mean function that is known at some points."""
+
+    def __init__(self, points: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        super().__init__()
+        self._values = {p.tobytes(): float(v) for p, v in zip(points, values, strict=True)}
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """x (..., d) -> (...)."""
+        rows = x.detach().numpy().reshape(-1, x.shape[-1])
+        return torch.tensor([self._values[np.ascontiguousarray(row).tobytes()] for row in rows]).reshape(x.shape[:-1])
+
+
+def _table(points: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
+    return lambda: _Table(points, values)
