@@ -7,7 +7,6 @@ Loops of problem P0 (360 steps, horizon 5) on circuits whose R0 is drawn; both w
 
 import argparse
 import json
-import os
 import statistics
 import time
 from dataclasses import replace
@@ -18,6 +17,7 @@ import numpy as np
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import Backoff, ChargingProblem
 from chargetune.episode.compiled import compiled_episode
+from chargetune.episode.cores import usable_cores
 
 THETAS, PLANTS = 5, 200
 
@@ -47,7 +47,7 @@ def main():
         alone.append(time.perf_counter() - between)
         same &= all(np.array_equal(a.input, b.input) for a, b in zip(whole, single, strict=True))
     ratios = [b / a for a, b in zip(together, alone, strict=True)]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = usable_cores()
     result = {
         "loops": len(cases), "cores": cores, "ensemble_s": statistics.median(together), "one_after_the_other_s": statistics.median(alone),
         "ratio": statistics.median(ratios), "ratio_range": [min(ratios), max(ratios)], "same": same,

@@ -77,6 +77,14 @@ def test_one_charge_tells_the_voltage_of_another():
     assert 0.85 < np.mean(covered) < 0.95
 
 
+def test_draws_do_not_depend_on_how_many_cores_there_are(monkeypatch):
+    problem = charge(ratios=(ResistanceRatio("R0"),))
+    posterior = ChargingTwin(problem).twin.fit([problem.episode(problem.space.default)])
+    drawn = posterior.draw(6, 3)
+    monkeypatch.setattr("chargetune.episode.cores.usable_cores", lambda: 1)
+    np.testing.assert_array_equal(posterior.draw(6, 3), drawn)
+
+
 def test_missing_samples_and_short_traces_are_taken_as_they_are():
     problem = charge()
     episode = problem.episode()

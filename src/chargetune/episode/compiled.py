@@ -7,7 +7,6 @@ thetas, seeds and mismatches builds it once. It gives the same trajectory as `ru
 from __future__ import annotations
 
 import hashlib
-import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.control.controller import Controller
 from chargetune.control.mpc import begin, cached, control_step, problem_of
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
+from chargetune.episode.cores import usable_cores
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
@@ -65,7 +65,7 @@ class CompiledEpisode:
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         if cores == 1 or len(plants) < 2 or not self.compiled:
             return [replace(self, plant=plant).run(theta, seed) for theta, plant in zip(thetas, plants, strict=True)]
         width = SHARE * cores

@@ -21,7 +21,7 @@ from chargetune.learning.twin import Twin
 __all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
-TRACES_MAX = 6
+TRACES_MAX = 5
 
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
@@ -106,10 +106,9 @@ class Belief:
     def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], OutputError | None]]:
         if (count, seed) not in self._drawn:
             draws = self.posterior.draw(count, seed)
-            seeds = np.random.SeedSequence(seed).generate_state(count)
-            self._drawn[count, seed] = [
-                (m, self.discrepancy.error(m, int(s)) if self.discrepancy else None) for m, s in zip(draws, seeds, strict=True)
-            ]
+            seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
+            errors = self.discrepancy.errors(draws, seeds) if self.discrepancy else [None] * count
+            self._drawn[count, seed] = list(zip(draws, errors, strict=True))
         return self._drawn[count, seed]
 
     @cached_property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.linalg import cho_factor, cho_solve
 
+from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.twin import blocks
@@ -28,7 +29,7 @@ OutputError = Callable[[Episode], Episode]
 """A predicted episode -> the same with what the twin cannot represent added to its outputs."""
 
 # Nodes of the table of a sample along each feature, by the number of features: a sample is drawn at its nodes together.
-NODES = {1: (101,), 2: (33, 15), 3: (25, 9, 6)}
+NODES = {1: (101,), 2: (33, 15), 3: (21, 7, 5)}
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
@@ -38,7 +39,7 @@ TOGETHER = 4.0
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """b_i(s) ~ GP(0, a_i^2 k(s, s')), k Matern 5/2: y_i = h_i(x, u, p) + b_i(s) + noise for each measured output i.
+    """b_i(s) ~ GP(0, a_i^2 k(s, s')), k Matern 3/2: y_i = h_i(x, u, p) + b_i(s) + noise for each measured output i.
 
     s are ``features`` of an episode, signals with the range by which they are scaled: for a charge the SOC, the current and,
     where it is measured, the temperature. The data are residuals, averaged over `BLOCKS` stretches of each episode, because
@@ -83,6 +84,11 @@ class Discrepancy:
 
         return add
 
+    def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[OutputError]:
+        """A sample of `error` for each of several plants, unknowns of shape (plants, d)."""
+        each(lambda part: part.root, self._parts)
+        return each(self.error, unknowns, seeds)
+
     def foretold(self, episode: Episode) -> tuple[float, float]:
         """(scale, mistake) of the prediction of one episode that was not learnt from, at its recorded input.
 
@@ -102,7 +108,7 @@ class Discrepancy:
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
         at = np.clip(self._at(episode), *np.array(list(self.features.values())).T)
-        spread = np.stack([np.maximum(np.diag(part.rest), 0.0) for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
+        spread = np.stack([part.variance for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
         known = (counts > 0) & np.isfinite(left)
         square, unmodelled, rest = left[known] ** 2, self._table(spread)(at)[known], rest[known]
@@ -168,15 +174,22 @@ class Discrepancy:
 
 @dataclass(frozen=True)
 class _Part:
-    """One output: residuals -> mean at the nodes, and the covariance at the nodes."""
+    """One output: residuals -> mean at the nodes, prior covariance at the nodes, and what of it the data take away."""
 
     gain: NDArray[np.float64]
-    rest: NDArray[np.float64]
+    prior: NDArray[np.float64]
+    cross: NDArray[np.float64]
+
+    @property
+    def variance(self) -> NDArray[np.float64]:
+        """At the nodes, shape (nodes,)."""
+        return np.asarray(np.maximum(np.diag(self.prior) - np.sum(self.gain * self.cross.T, axis=1), 0.0))
 
     @cached_property
     def root(self) -> NDArray[np.float64]:
         """A factor of the covariance, which neighbouring nodes leave singular to rounding."""
-        values, vectors = np.linalg.eigh((self.rest + self.rest.T) / 2)
+        rest = self.prior - self.gain @ self.cross
+        values, vectors = np.linalg.eigh((rest + rest.T) / 2)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
@@ -193,22 +206,23 @@ def _part(
     # In units of their prior medians all length scales have the same prior.
     medians = np.array(LENGTH[:d])
     kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD))
+    scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0))
     model = SingleTaskGP(
         torch.as_tensor(x / medians), torch.as_tensor(left[:, None] / size),
         torch.as_tensor(np.minimum(variance / size**2, 1e6)[:, None]),
-        covar_module=ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0)), mean_module=ZeroMean(),
+        covar_module=scaled, mean_module=ZeroMean(),
         outcome_transform=None, input_transform=None,
     )  # fmt: skip
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     with torch.no_grad():
         both = torch.as_tensor(np.vstack([x, lattice]) / medians)
-        whole = size**2 * model.covar_module(both).to_dense().numpy()
+        whole = kernel(both).to_dense().numpy()
         # One trajectory that the model fits says little of others.
-        whole += least**2 * kernel(both).to_dense().numpy() * np.outer(weight, weight)
+        whole *= size**2 * float(scaled.outputscale) + least**2 * np.outer(weight, weight)
     n = len(x)
     seen = cho_factor(whole[:n, :n] + np.diag(variance + JITTER * whole[0, 0]), lower=True)
     gain = cho_solve(seen, whole[:n, n:]).T
-    return _Part(gain, whole[n:, n:] - gain @ whole[:n, n:])
+    return _Part(gain, whole[n:, n:], whole[:n, n:])
 
 
 def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

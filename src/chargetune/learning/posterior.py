@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.cores import each
+
 if TYPE_CHECKING:
     from chargetune.learning.twin import Twin
 
@@ -53,7 +55,9 @@ class Posterior:
         drawn = normal @ self.root.T
         if not self.seen:
             return np.asarray(self.mode + drawn, dtype=np.float64)
-        return np.array([self._moved(draw) for draw in drawn])
+        # What all share is computed before they part.
+        _ = self._at_mode, self._precision
+        return np.array(each(self._moved, drawn))
 
     def _moved(self, draw: NDArray[np.float64]) -> NDArray[np.float64]:
         for fresh in (False, True, True):
