@@ -38,7 +38,7 @@ TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.5
 # Standard deviations that may be taken back where nothing is promised, the first unless the acquisition prefers another. With none
-# half of the plants would break a limit, with one every fortieth trial did by more than 1 mV.
+# half of the plants would break a limit; where one or none were allowed, 3 and 5 of 120 trials did by more than 1 mV (decision 0010).
 CAUTION = (2.0, 3.0)
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
