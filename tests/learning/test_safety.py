@@ -127,6 +127,21 @@ def test_a_trial_without_a_trace_teaches_nothing_and_the_start_is_proposed_again
     np.testing.assert_array_equal(proposed, [declared])
 
 
+def test_a_safe_batch_is_of_different_thetas_that_all_passed():
+    problem = charge()
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    trials, _, _ = learn(problem, tuner, 2)
+    batch = tuner.ask(problem.space, trials, 3)
+    np.testing.assert_array_equal(batch[0], tuner.ask(problem.space, trials)[0])
+    assert len(np.unique(batch, axis=0)) > 1
+    belief, others_seed = believe(tuner.loop, trials), 12345
+    for theta in batch:
+        # Other plants than those it was chosen by: three standard errors of a share of 400 below 0.95.
+        assert belief.predict(theta, 400, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 400) ** 0.5
+    running = SimpleNamespace(number=2, theta=tuple(batch[0]), status="running", score=None, episode=None)
+    np.testing.assert_array_equal(tuner.ask(problem.space, [*trials, running])[0], batch[1])
+
+
 def test_a_spent_budget_stops_before_anything_is_proposed():
     problem = charge(noise=0.0)
     score, episode, _ = problem(problem.space.default, 0)

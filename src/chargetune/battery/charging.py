@@ -332,8 +332,11 @@ class ChargingProblem:
         plant = self.plant
         return compiled_episode(self.controller, plant, self.steps) if isinstance(plant, SimulatedPlant) else None
 
-    def score(self, episode: Episode) -> Score:
-        """The verdict on what was measured. Raises ValueError when a measurement is not a number."""
+    def score(self, episode: Episode, *, metrics: bool = True) -> Score:
+        """The verdict on what was measured, without figures for people where ``metrics`` is False.
+
+        Raises ValueError when a measurement is not a number.
+        """
         _, soc = episode.signal("soc")
         measured = [values for limit in self.limits for values in episode.signal(limit.signal)]
         if not (len(soc) and all(np.all(np.isfinite(values)) for values in (*measured, soc))):
@@ -342,20 +345,23 @@ class ChargingProblem:
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
         excess = {limit.name: limit.excess(episode, self.judged(limit)[0]) for limit in self.limits}
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
+        return Score(
+            objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(soc),
+            performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
+            excess={name: float(np.max(values)) for name, values in excess.items()},
+            tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
+            metrics=self._metrics(episode) if metrics else {},
+            profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
+        )
+
+    def _metrics(self, episode: Episode) -> dict[str, float | None]:
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
         # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
         metrics["violation_mVs"] = self.violation_mVs(episode)
         metrics["current_max_excess_A"] = float(np.max(episode.input[:, 0]) - (self.current_max_A or 0.0))
         for limit in self.limits[2:]:
             metrics |= limit.metrics(episode)
-        return Score(
-            objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(soc),
-            performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
-            excess={name: float(np.max(values)) for name, values in excess.items()},
-            tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
-            metrics=metrics,
-            profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
-        )
+        return metrics
 
     def _quickness(self, soc: NDArray[np.float64]) -> float:
         wanted = self.charge_time_to_soc or 0.0

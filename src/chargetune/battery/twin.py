@@ -31,6 +31,8 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
+# Plants that are remembered: those of two ensembles.
+PLANTS_KEPT = 128
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 
@@ -102,6 +104,19 @@ class ChargingTwin:
         return out
 
     def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
+        # An ensemble goes through many thetas: its plants are made once.
+        key = unknowns.tobytes()
+        if key not in self._plants:
+            while len(self._plants) >= PLANTS_KEPT:
+                self._plants.pop(next(iter(self._plants)))
+            self._plants[key] = self._made(unknowns)
+        return self._plants[key]
+
+    @cached_property
+    def _plants(self) -> dict[bytes, SimulatedPlant]:
+        return {}
+
+    def _made(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
         sizes, own = self.twin.model.parameter_blocks, self._loop.plant
         values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
         start = dict(zip(own.model.state_names, (float(v) for v in self.twin.start_state(unknowns)), strict=True))
@@ -114,7 +129,7 @@ class ChargingTwin:
     def score(self, episode: Episode) -> Score | None:
         """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
         try:
-            return self._exact.score(episode)
+            return self._exact.score(episode, metrics=False)
         except ValueError:
             return None
 

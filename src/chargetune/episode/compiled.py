@@ -10,7 +10,7 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import casadi as ca
@@ -21,15 +21,12 @@ from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.control.controller import Controller
 from chargetune.control.mpc import begin, cached, control_step, problem_of
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
-from chargetune.episode.cores import usable_cores
+from chargetune.episode.cores import each
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
-
-# Loops of an ensemble that each core runs before the results are taken up.
-SHARE = 8
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class CompiledEpisode:
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
         """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
         given, unknown = self._arguments(theta, self.plant, seed, trips)
-        return self._episode(_evaluated(self.function, given, unknown, (self.steps, sum(self.widths))), self.plant, seed, trips)
+        return self._episode(_evaluated(self.function, (self.steps, sum(self.widths)), given, unknown), self.plant, seed, trips)
 
     def run_each(self, thetas: Sequence[ArrayLike | None], plants: Sequence[SimulatedPlant], seed: int = 0) -> list[Episode]:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
@@ -65,40 +62,43 @@ class CompiledEpisode:
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
-        cores = usable_cores()
-        if cores == 1 or len(plants) < 2 or not self.compiled:
-            return [replace(self, plant=plant).run(theta, seed) for theta, plant in zip(thetas, plants, strict=True)]
-        width = SHARE * cores
-        together = cached(
-            f"{width} on {cores} cores of {id(self.function)}", lambda: (self.function, self.function.map(width, "thread", cores))
-        )[1]
-        out: list[Episode] = []
-        for first in range(0, len(plants), width):
-            part = list(zip(thetas[first : first + width], plants[first : first + width], strict=True))
-            given, unknown = zip(*(self._arguments(theta, plant, seed, ()) for theta, plant in part), strict=True)
-            spare = width - len(part)
-            # The function has this one width: the last loop fills what is left of it.
-            recorded = _evaluated(
-                together, np.stack([*given, *given[-1:] * spare]), np.stack([*unknown, *unknown[-1:] * spare]),
-                (width, self.steps, sum(self.widths)),
-            )  # fmt: skip
-            out += [self._episode(one, plant, seed, ()) for one, (_, plant) in zip(recorded, part, strict=False)]
-        return out
+        # An ensemble has few thetas: what depends on theta alone is computed once for each.
+        of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
+        given, unknown = [], []
+        for theta, plant in zip(thetas, plants, strict=True):
+            check_run(plant, self.steps, seed, ())
+            values = self.controller.theta_vector(theta)
+            key = values.tobytes()
+            if key not in of_theta:
+                of_theta[key] = self._of_theta(values)
+            known, unforeseen = self._with_plant(of_theta[key], plant, seed)
+            given.append(known)
+            unknown.append(unforeseen)
+        evaluated = partial(_evaluated, self.function, (self.steps, sum(self.widths)))
+        # The loops alone go into threads, as machine code: all else waits for the interpreter.
+        recorded = each(evaluated, given, unknown) if self.compiled and len(plants) > 1 else list(map(evaluated, given, unknown))
+        return [self._episode(one, plant, seed, ()) for one, plant in zip(recorded, plants, strict=True)]
 
     def _arguments(
         self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What is given once an episode, shape (n,), and once an interval, shape (steps, m)."""
-        controller = self.controller
-        values = controller.theta_vector(theta)
         check_run(plant, self.steps, seed, trips)
-        memory = begin(controller)
-        q = problem_of(controller).prepare(values, controller.setpoint, controller.model.nominal)
+        return self._with_plant(self._of_theta(self.controller.theta_vector(theta)), plant, seed)
+
+    def _of_theta(self, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """The controller's memory at the start, and its numbers."""
+        memory = begin(self.controller)
+        q = problem_of(self.controller).prepare(values, self.controller.setpoint, self.controller.model.nominal)
+        return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
+
+    def _with_plant(
+        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         errors, process = disturbances(plant, self.steps, seed)
         _, _, resolution = plant.sensors.vectors(plant.outputs)
-        start_state, plant_q = plant.start_state, self.prepare_plant(plant.model.nominal)
-        fixed = (start_state, memory.estimator, memory.last_input, memory.warm, q, plant_q, resolution, errors[0, 1])
-        given = np.concatenate([np.asarray(part, dtype=float).ravel() for part in fixed])
+        plant_q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
+        given = np.concatenate([plant.start_state, *of_theta, plant_q, resolution, errors[0, 1]])
         return given, np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
 
     def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
@@ -129,7 +129,7 @@ class CompiledEpisode:
 
 
 def _evaluated(
-    function: ca.Function, given: NDArray[np.float64], unknown: NDArray[np.float64], shape: tuple[int, ...]
+    function: ca.Function, shape: tuple[int, ...], given: NDArray[np.float64], unknown: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     recorded = np.empty(shape)
     # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.

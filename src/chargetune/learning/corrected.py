@@ -35,6 +35,8 @@ Candidate = tuple[NDArray[np.float64], Prediction]
 PROVED = 2
 # Of a value: a twin that foretold every score to the last digit leaves nothing to be scaled by.
 LEAST = 1e-9
+# In units of s, f is never as far from its mean.
+FAR = 100.0
 
 
 def most_promising(
@@ -78,12 +80,16 @@ class _Corrected(Model):
         foretold = np.array([_values(s) for _, s in (*done, *known)])
         scale = np.sqrt(np.mean((measured - foretold[: len(done)]) ** 2, axis=0))
         scale = np.maximum(scale, LEAST * np.max(np.abs(foretold), axis=0)) + np.finfo(float).tiny
+        # A limit that nothing comes near has the probability 1, and needs no process to say so.
+        near = np.max(np.vstack([measured, foretold]) / scale, axis=0) > -FAR
+        near[0] = True
+        measured, foretold, scale = measured[:, near], foretold[:, near], scale[near]
         points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for (theta, _), _ in known)]))
         x, y = torch.as_tensor(points[: len(done)]), torch.as_tensor(measured / scale)
         self._model = ModelListGP(
             *(GaussianProcess(mean=_table(points, foretold[:, i] / scale[i]), standardise=False).fit(x, y[:, i]) for i in range(len(scale)))
         )
-        spread = np.array([np.std([_values(s) for s in c[1].scores], axis=0) for c, _ in known])
+        spread = np.array([np.std([_values(s) for s in c[1].scores], axis=0) for c, _ in known])[:, near]
         self._spread = [_table(points[len(done) :], spread[:, i] / scale[i])() for i in range(len(scale))]
         kept = [s.objective for s in scores if s.feasible]
         self._best = max(kept) / scale[0] if kept else None

@@ -15,8 +15,8 @@ from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import map_coordinates
 
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
@@ -69,16 +69,14 @@ class Discrepancy:
             if stream is not None:
                 table = table + part.root @ stream.standard_normal(len(table))
             tables.append(table)
-        table = self._table(np.stack(tables, axis=-1).reshape(*self._nodes, len(names)))
-        ranges = np.array(list(self.features.values())).T
+        at_nodes = self._table(np.stack(tables))
 
         def add(episode: Episode) -> Episode:
             columns = [episode.output_names.index(name) for name in names]
             changed = []
             for k, outputs in enumerate((episode.output_start, episode.output_end)):
-                at = np.stack([_feature(episode, name)[k] for name in self.features], axis=1)
                 out = outputs.copy()
-                out[:, columns] += table(np.clip(at, *ranges))
+                out[:, columns] += at_nodes(np.stack([_feature(episode, name)[k] for name in self.features], axis=1))
                 changed.append(out)
             return replace(episode, output_start=changed[0], output_end=changed[1])
 
@@ -107,11 +105,10 @@ class Discrepancy:
         left, counts = blocks(twin.measured(episode) - twin.measured(filled))
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        at = np.clip(self._at(episode), *np.array(list(self.features.values())).T)
-        spread = np.stack([part.variance for part in self._parts], axis=-1).reshape(*self._nodes, len(columns))
+        spread = self._table(np.stack([part.variance for part in self._parts]))
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
         known = (counts > 0) & np.isfinite(left)
-        square, unmodelled, rest = left[known] ** 2, self._table(spread)(at)[known], rest[known]
+        square, unmodelled, rest = left[known] ** 2, spread(self._at(episode))[known], rest[known]
         scales = np.geomspace(0.1, 10.0, 61)
         variance = scales[:, None] ** 2 * unmodelled + rest
         chance = -0.5 * np.sum(np.log(variance) + square / variance, axis=1) / TOGETHER - 0.5 * np.log(scales) ** 2
@@ -119,9 +116,11 @@ class Discrepancy:
         mistake = np.sqrt(np.mean(square / (rest + np.broadcast_to(stated**2, left.shape)[known]))) if known.any() else 0.0
         return float(scales[np.argmax(chance)]), float(mistake)
 
-    def _table(self, values: NDArray[np.float64]) -> RegularGridInterpolator:
-        nodes = [np.linspace(low, high, count) for count, (low, high) in zip(self._nodes, self.features.values(), strict=True)]
-        return RegularGridInterpolator(nodes, values, bounds_error=False, fill_value=None)
+    def _table(self, values: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Values at the nodes, shape (outputs, nodes) -> (features (K, n) -> values (K, outputs)), linear in between, held beyond."""
+        last = np.array(self._nodes)[:, None] - 1.0
+        lattices = values.reshape(-1, *self._nodes)
+        return lambda at: np.stack([map_coordinates(v, self._unit(at).T * last, order=1, mode="nearest") for v in lattices], axis=1)
 
     def _at(self, episode: Episode) -> NDArray[np.float64]:
         """Mean features of every stretch, shape (stretches, features)."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
 
 from chargetune.episode.cores import each
 
@@ -16,8 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Posterior"]
 
-# Steps by which a draw is brought to what it should predict, and twice the loss of log-likelihood at which it is there.
-CHORDS, MISFIT = 6, 9.0
+# Steps by which a draw is brought to what it should predict; twice the loss of log-likelihood at which it may stay, and at which it is
+# there: another step would not be seen in the data.
+CHORDS, MISFIT, THERE = 6, 9.0, 0.3
+# The slopes at a draw serve the next step too when the last one left less than this share of the loss.
+KEPT = 0.2
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,11 @@ class Posterior:
         for fresh in (False, True, True):
             m = self.mode + draw
             misfit, pull = self._misfit(m, draw)
+            curvature, fallen = None, 1.0
             for _ in range(CHORDS):
-                step = np.linalg.solve(self._curvature(m), pull) if fresh else self.root @ (self.root.T @ pull)
+                if fresh and (curvature is None or fallen > KEPT):
+                    curvature = lu_factor(self._curvature(m))
+                step = lu_solve(curvature, pull) if curvature is not None else self.root @ (self.root.T @ pull)
                 shares = (1.0, 0.5, 0.25) if fresh else (1.0,)
                 for share in shares:
                     ahead = m - share * step
@@ -73,8 +80,9 @@ class Posterior:
                         break
                 else:
                     break
-                m, misfit, pull, gain = ahead, other, following, misfit - other
-                if gain < 0.05:
+                gain, fallen = misfit - other, other / misfit
+                m, misfit, pull = ahead, other, following
+                if gain < 0.05 or misfit < THERE:
                     break
             if misfit < MISFIT:
                 return m

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from chargetune.control.compiler import compile_library, find_compiler
+from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.learning.posterior import Posterior
 from chargetune.model.model import Model
@@ -137,7 +138,7 @@ class Twin:
     def predict(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Measured outputs at both ends of every interval under ``inputs`` (K, nu), shape (K, 2, number of measured outputs)."""
         flat = self._roll(0, m, inputs)
-        return flat.T.reshape(-1, 2, len(self.noise_sd))[: len(inputs)]
+        return flat.reshape(-1, 2, len(self.noise_sd))[: len(inputs)]
 
     def slopes(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Exact slopes of `predict` with respect to m, shape (K, 2, number of measured outputs, d)."""
@@ -150,14 +151,14 @@ class Twin:
         function = _simulated(_Key(self), length)[which]
         given = [np.ascontiguousarray(part, dtype=float) for part in (m, *_numbers(self), padded)]
         out = np.empty(function.size_out(0)[::-1])
-        # CasADi reads and writes these arrays in place, by columns: C order of the transposed matrix.
+        # CasADi reads and writes these arrays in place, by columns: one column an interval is C order with one row an interval.
         buffer: Any
         buffer, evaluate = function.buffer()
         for i, part in enumerate(given):
             buffer.set_arg(i, part.data)
         buffer.set_res(0, out.data)
         evaluate()
-        return out.T
+        return out
 
     def measured(self, episode: Episode) -> NDArray[np.float64]:
         """The measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
@@ -177,20 +178,8 @@ class Twin:
         e = np.zeros(len(factor)) if guess is None or not data else np.linalg.solve(factor, guess)
         spread, cost_jacobian, unmodelled = noise, np.eye(len(factor)), np.zeros(len(names))
         for _ in range(1 + REFITS):
-
-            def residuals(e: NDArray[np.float64], spread: NDArray[np.float64] = spread) -> NDArray[np.float64]:
-                parts = [np.nan_to_num((self.predict(factor @ e, u) - y) / spread, nan=0.0).ravel() for u, y in data]
-                return np.concatenate([e, *parts])
-
-            def jacobian(e: NDArray[np.float64], spread: NDArray[np.float64] = spread) -> NDArray[np.float64]:
-                parts = []
-                for u, y in data:
-                    slopes = self.slopes(factor @ e, u)
-                    seen = np.isfinite(y)[..., None]
-                    parts.append((np.where(seen, slopes, 0.0) / spread[:, None]).reshape(-1, len(e)) @ factor)
-                return np.vstack([np.eye(len(e)), *parts])
-
-            found = least_squares(residuals, e, jac=jacobian, method="trf", x_scale=1.0, max_nfev=30, ftol=FTOL, xtol=XTOL)
+            misfit = _Misfit(self, data, spread)
+            found = least_squares(misfit.values, e, jac=misfit.slopes, method="trf", x_scale=1.0, max_nfev=30, ftol=FTOL, xtol=XTOL)
             e, cost_jacobian = found.x, found.jac
             if not (data and discrepancy):
                 break
@@ -202,6 +191,44 @@ class Twin:
         curvature, directions = np.linalg.eigh(cost_jacobian.T @ cost_jacobian)
         root = factor @ (directions / np.sqrt(curvature))
         return Posterior(self, factor @ e, root, unmodelled, spread, tuple((u, np.isfinite(y)) for u, y in data))
+
+
+class _Misfit:
+    """|e|^2 + sum |(y - h(factor e)) / spread|^2 as the square of d + 1 numbers instead of as many as there are samples.
+
+    With r the residuals and J their slopes, the triangle R of [J r] = Q R has the same J'J, J'r and r'r, which is all that a
+    least-squares step sees. From the Cholesky factor of [J r]'[J r]: the prior keeps it far from singular.
+    """
+
+    def __init__(self, twin: Twin, data: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]) -> None:
+        self._twin, self._data, self._spread = twin, data, spread
+        self._at, self._triangle = np.zeros(0), np.zeros((0, 0))
+
+    def values(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Shape (d + 1,)."""
+        return np.asarray(self._known(e)[:, -1])
+
+    def slopes(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
+        """With respect to e, shape (d + 1, d)."""
+        return np.asarray(self._known(e)[:, :-1])
+
+    def _known(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not np.array_equal(e, self._at):
+            own = np.hstack([np.eye(len(e)), e[:, None]])
+            squares = each(self._square, [e] * len(self._data), self._data)
+            total = sum(squares, start=own.T @ own)
+            # Where the data fit to the last digit nothing is left of the last pivot but rounding.
+            total[-1, -1] += np.finfo(float).eps * (1.0 + np.trace(total))
+            self._at, self._triangle = e.copy(), np.linalg.cholesky(total).T
+        return self._triangle
+
+    def _square(self, e: NDArray[np.float64], trace: tuple[NDArray[np.float64], NDArray[np.float64]]) -> NDArray[np.float64]:
+        twin, (u, y) = self._twin, trace
+        m = twin.prior_factor @ e
+        left = np.nan_to_num((twin.predict(m, u) - y) / self._spread, nan=0.0)
+        slopes = np.where(np.isfinite(y)[..., None], twin.slopes(m, u), 0.0) / self._spread[:, None]
+        both = np.hstack([slopes.reshape(-1, len(e)) @ twin.prior_factor, left.reshape(-1, 1)])
+        return np.asarray(both.T @ both)
 
 
 def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -324,7 +351,7 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     _, seen = plain.mapaccum("values", count)(state, inputs, *every)
     _, _, steep = with_slopes.mapaccum("slopes", count, 2)(state, first, inputs, *every)
     simulate = ca.Function("simulate", [*given, inputs], [seen])
-    sloped = ca.Function("sloped", [*given, inputs], [steep.T])
+    sloped = ca.Function("sloped", [*given, inputs], [steep])
     if find_compiler() is None:
         return simulate, sloped
     try:

@@ -21,6 +21,7 @@ from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
 from chargetune.learning.twin_search import AIMED as SEARCHED
 from chargetune.learning.twin_search import Search
+from chargetune.learning.way_back import way_back
 from chargetune.model.parameters import ParameterSpace
 
 __all__ = ["TwinTuner"]
@@ -42,14 +43,12 @@ UNPROVED = 1.5
 CAUTION = (2.0, 3.0)
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
+# Two starts that are closer than this share of the range in every entry lead to one end.
+APART = 0.1
 # Iterations of the search that ends it.
 POLISHING = 8
-# A change of theta that promises less than this share of the objective is not worth a risk.
-GAIN = 1e-3
-# Runs of neighbouring entries that go back, one after the other.
-BACKS = 3
-# Of a limit's tolerance, what the upper side of the prediction may use.
-AIMED = 0.5
+# Of a limit's tolerance, what the upper side of the prediction may use: in safe mode, and where nothing is promised.
+AIMED, AIMED_UNSAFE = 0.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,8 @@ class TwinTuner:
     plus some sd of an ensemble of plants. Candidates are those that keep every limit on a share of the ensemble of at least the
     stated probability, and the same acquisition picks; the first theta is the declared start, or the most cautious corner. Where
     no such theta is found the best one tried that is still predicted to be safe is proposed again, with a warning; where there is
-    none, or the budget of violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant.
+    none, or the budget of violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant. Further thetas of a batch,
+    and those proposed beside running trials, are the other candidates that passed; where there are too few they are repeated.
     """
 
     loop: TwinLoop
@@ -89,8 +89,11 @@ class TwinTuner:
 
     def _ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int) -> NDArray[np.float64]:
         if self.safety:
-            # A trial that is running has shown nothing yet.
-            return np.tile(self._safe(space, [t for t in trials if t.status != "running"], self.safety), (n, 1))
+            # A trial that is running has shown nothing yet, and what it tries need not be tried twice.
+            running = [np.array(t.theta) for t in trials if t.status == "running"]
+            safe = self._safe(space, [t for t in trials if t.status != "running"], self.safety)
+            fresh = [theta for theta in safe if not any(np.array_equal(theta, other) for other in running)] or safe
+            return np.array([fresh[i % len(fresh)] for i in range(n)])
         belief = believe(self.loop, trials) if trials else None
         if belief is None or belief.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
@@ -104,17 +107,17 @@ class TwinTuner:
             )
             return ConstrainedLogEI(self.seed).ask(space, trials, n)
         first = self._points(space, trials)
-        drawn = [belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n)]
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
-        plants = drawn if pending else [belief.expected, *drawn[: n - 1]]
+        drawn = [belief.plant(self.seed + 7919 * len(trials) + k) for k in range(n if pending else n - 1)]
+        plants = drawn if pending else [belief.expected, *drawn]
         searches = [self._searched(Search(self.loop, plant, space), first) for plant in plants]
         thetas = [space.from_unit(search.best()) for search in searches]
         if pending:
             return np.array(thetas)
         seed = self.seed + 7919 * len(trials)
         predicted = belief.predict(thetas[0], DRAWS, seed)
-        cautious = [self._polished(space, belief, thetas[0], predicted, sd, searches[0].known) for sd in CAUTION]
+        cautious = [self._polished(space, belief, thetas[0], predicted, sd, searches[0].known, AIMED_UNSAFE) for sd in CAUTION]
         candidates = [(theta, belief.predict(theta, DRAWS, seed)) for theta in cautious]
         best, _ = most_promising(belief, space, trials, candidates, seed)
         return np.array([best, *thetas[1:]])
@@ -128,16 +131,19 @@ class TwinTuner:
         search.scale(first)
         for start in (first[0], first[-1]):
             search.envelope(start, self.steps)
-        # The best of all so far; the best of the pool, in case a step by what is covered is not the way to it.
-        for start in (search.best(), min(first, key=search.merit)):
-            search.refine(start, self.iterations)
+        search.refine(search.best(), self.iterations)
+        # The best of the pool, in case a step by what is covered is not the way to it, and it has not led there.
+        other = min(first, key=search.merit)
+        if np.max(np.abs(other - search.best())) > APART:
+            search.refine(other, self.iterations)
         return search
 
-    def _safe(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> NDArray[np.float64]:
+    def _safe(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> list[NDArray[np.float64]]:
+        """Every theta that is known to be safe enough for the next trial, each once, the most promising first."""
         belief = believe(self.loop, trials)
         if belief.discrepancy is None:
             # Trials that left no trace have taught nothing.
-            return self._start(space, belief, safety)
+            return [self._start(space, belief, safety)]
         self._check_budget(trials, safety)
         seed = self.seed + 7919 * len(trials)
         proved = len(belief.discrepancy.episodes) > 1
@@ -158,10 +164,10 @@ class TwinTuner:
             following = covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
             # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
             theta, before = following if k < 1 else (theta + following) / 2, theta
-            if passed and np.max(np.abs(theta - before) / (space.upper - space.lower)) < SETTLED:
+            if passed and _moved(space, before, theta) < SETTLED:
                 break
         if not passed:
-            return self._tried(trials, belief, safety, seed)
+            return [self._tried(trials, belief, safety, seed)]
         candidates = [one for _, one in sorted(passed, key=lambda one: -one[0])]
         if proved:
             polished = self._polished(space, belief, *candidates[0], deviations)
@@ -169,11 +175,14 @@ class TwinTuner:
             if predicted.probability() >= safety.probability:
                 candidates.insert(0, (polished, predicted))
         theta, predicted = most_promising(belief, space, trials, candidates, seed)
-        for shares in ((1.0, 0.5), (0.5,), (0.25,)):
-            nearer = self._nearer(space, trials, belief, theta, predicted.upper_windows(deviations), shares)
+        # After a single trial the others are further ahead, and the prior has not yet been wrong.
+        others = [other for other, _ in candidates if proved and not np.array_equal(other, theta)]
+        upper, search = predicted.upper_windows(deviations), Search(self.loop, belief.expected, space)
+        for shares in ((1.0, 0.5), (0.5,), (0.25,)) if (known := _kept(trials)) else ():
+            nearer = way_back(search, space, known[0], theta, upper, shares)
             if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability:
-                return nearer
-        return theta
+                return [nearer, *others]
+        return [theta, *others]
 
     def _polished(
         self,
@@ -183,65 +192,19 @@ class TwinTuner:
         predicted: Prediction,
         deviations: float,
         known: dict[bytes, Score | None] | None = None,
+        aimed: float = AIMED,
     ) -> NDArray[np.float64]:
         """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
         expected = belief.central(theta)
         score = None if expected is None else self.loop.score(expected)
         if score is None:
             return theta
-        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
+        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - aimed)
         search = Search(self.loop, belief.expected, space, np.nan_to_num(margin), known)
         start = space.to_unit(theta)
         search.scale([start, space.to_unit(space.default)])
         search.refine(start, POLISHING)
         return space.from_unit(search.best())
-
-    def _nearer(
-        self,
-        space: ParameterSpace,
-        trials: Sequence[TrialLike],
-        belief: Belief,
-        theta: NDArray[np.float64],
-        upper: NDArray[np.float64],
-        shares: tuple[float, ...],
-    ) -> NDArray[np.float64]:
-        """``theta`` with all entries whose change promises nothing moved back by these shares to where they were in the best trial.
-
-        A change is a step into what has not been seen: nothing is risked for nothing. Where no change promises anything it is
-        the theta of the best trial itself. ``upper`` is the upper side of the excess by window at ``theta``; its distance to what is
-        expected there is held on the way.
-        """
-        known = _kept(trials)
-        if not known:
-            return theta
-        best = known[0]
-        search = Search(self.loop, belief.expected, space)
-        own = search.score(space.to_unit(theta))
-        if own is None:
-            return theta
-        margin = np.nan_to_num(upper - windows_of(own))
-        most = max(0.0, float(np.nanmax(windows_of(own) + margin)))
-
-        def promised(points: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-            scores = search.scores([space.to_unit(p) for p in points])
-            kept = [s is not None and float(np.nanmax(windows_of(s) + margin)) <= most for s in scores]
-            return np.array([s.objective if s is not None and k else -np.inf for s, k in zip(scores, kept, strict=True)])
-
-        ahead, least = (float(value) for value in promised([best, theta]))
-        least -= GAIN * abs(least)
-        if ahead >= least and shares[0] == 1.0:
-            return best
-        # Neighbours go back together: they are nodes of one curve, and one alone would bend it.
-        runs = [(i, j) for i in range(len(theta)) for j in range(i + 1, len(theta) + 1)]
-        for share in shares:
-            for _ in range(BACKS):
-                moved = [np.concatenate([theta[:i], (theta + share * (best - theta))[i:j], theta[j:]]) for i, j in runs]
-                way = np.array([np.sum(np.abs(one - theta) / (space.upper - space.lower)) for one in moved])
-                way[promised(moved) < least] = 0.0
-                if not np.any(way > 0):
-                    break
-                theta = moved[int(np.argmax(way))]
-        return theta
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Envelope steps on the plant that is expected."""
@@ -249,7 +212,9 @@ class TwinTuner:
             episode = belief.central(theta)
             if episode is None:
                 break
-            theta = covering(self.loop.controller, episode, theta, self.loop.measured_rows(episode))
+            theta, before = covering(self.loop.controller, episode, theta, self.loop.measured_rows(episode)), theta
+            if _moved(self.loop.controller.theta, before, theta) < SETTLED:
+                break
         return theta
 
     def _tried(self, trials: Sequence[TrialLike], belief: Belief, safety: Safety, seed: int) -> NDArray[np.float64]:
@@ -283,6 +248,11 @@ class TwinTuner:
                 f"(the most cautious one: {chances[at]:.2f}); declare a start that does"
             )
         return space.from_unit(corners[at])
+
+
+def _moved(space: ParameterSpace, before: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """The largest change of an entry, as a share of its range."""
+    return float(np.max(np.abs(theta - before) / (space.upper - space.lower)))
 
 
 def _kept(trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
