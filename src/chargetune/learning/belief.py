@@ -74,6 +74,11 @@ class Belief:
     discrepancy: Discrepancy | None
     mistake: float = 0.0
 
+    @property
+    def proved(self) -> bool:
+        """Whether there is a trial that those before it foretold."""
+        return self.discrepancy is not None and len(self.discrepancy.episodes) > 1
+
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
         return self.expected([theta])[0]

@@ -47,8 +47,9 @@ WIDER = 1.25
 APART = 0.1
 # Iterations of the search that ends it.
 POLISHING = 8
-# Of a limit's tolerance, what the upper side of the prediction may use: in safe mode, and where nothing is promised.
-AIMED, AIMED_UNSAFE = 0.5, 1.0
+# Of a limit's tolerance, what the upper side of the prediction may use; and what it may where nothing is promised and keeping back
+# the rest costs more than this share of the objective: where a charge ends at its limit, all of it is little.
+AIMED, WHOLE, COSTLY = 0.5, 1.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,12 @@ class TwinTuner:
             return np.array(thetas)
         seed = self.seed + 7919 * len(trials)
         predicted = belief.predict(thetas[0], DRAWS, seed)
-        cautious = [self._polished(space, belief, thetas[0], predicted, sd, searches[0].known, AIMED_UNSAFE) for sd in CAUTION]
+        known = searches[0].known
+        for aimed in (AIMED, WHOLE):
+            cautious = [self._polished(space, belief, thetas[0], predicted, sd, known, aimed) for sd in CAUTION]
+            ahead, least = belief.scores([thetas[0], cautious[0]])
+            if not (belief.proved and ahead and least and ahead.objective - least.objective > COSTLY * abs(least.objective)):
+                break
         candidates = [(theta, belief.predict(theta, DRAWS, seed)) for theta in cautious]
         best, _ = most_promising(belief, space, trials, candidates, seed)
         return np.array([best, *thetas[1:]])
@@ -146,8 +152,7 @@ class TwinTuner:
             return [self._start(space, belief, safety)]
         self._check_budget(trials, safety)
         seed = self.seed + 7919 * len(trials)
-        proved = len(belief.discrepancy.episodes) > 1
-        deviations = float(norm.ppf(safety.probability)) + (TOGETHER if proved else TOGETHER + UNPROVED)
+        deviations = float(norm.ppf(safety.probability)) + (TOGETHER if belief.proved else TOGETHER + UNPROVED)
         # What the plant would allow if the belief were true: from there on caution only takes back.
         theta = self._covered(belief, np.array(trials[-1].theta))
         passed: list[tuple[float, Candidate]] = []
@@ -169,14 +174,14 @@ class TwinTuner:
         if not passed:
             return [self._tried(trials, belief, safety, seed)]
         candidates = [one for _, one in sorted(passed, key=lambda one: -one[0])]
-        if proved:
+        if belief.proved:
             polished = self._polished(space, belief, *candidates[0], deviations)
             predicted = belief.predict(polished, DRAWS, seed)
             if predicted.probability() >= safety.probability:
                 candidates.insert(0, (polished, predicted))
         theta, predicted = most_promising(belief, space, trials, candidates, seed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
-        others = [other for other, _ in candidates if proved and not np.array_equal(other, theta)]
+        others = [other for other, _ in candidates if belief.proved and not np.array_equal(other, theta)]
         upper, search = predicted.upper_windows(deviations), Search(self.loop, belief.expected, space)
         for shares in ((1.0, 0.5), (0.5,), (0.25,)) if (known := _kept(trials)) else ():
             nearer = way_back(search, space, known[0], theta, upper, shares)
