@@ -89,7 +89,7 @@ def test_an_interrupted_campaign_goes_on(folder, workers):
 
 
 def test_dead_workers_cost_nothing(folder):
-    (folder / "c.toml").write_text(CAMPAIGN.replace("trials = 5", "trials = 30"))
+    (folder / "c.toml").write_text(CAMPAIGN.replace("trials = 5", "trials = 15"))
     entries = load_campaign(folder / "c.toml")
     with process_executor(2) as executor:
         pids = {executor.submit(os.getpid).result() for _ in range(20)}

@@ -12,7 +12,7 @@ CONFIG = """
 [study]
 name = "killed"
 tuner = "default"
-trials = 26
+trials = 16
 [controller]
 mismatch_seed = 2
 [episode]

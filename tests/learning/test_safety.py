@@ -100,7 +100,7 @@ def test_temperature_and_anode_potential_are_kept_while_learning():
     loop = ChargingTwin(problem)
     assert set(loop.twin.noise_sd) == {"voltage_V", "temperature_K", "anode_potential_V"}
     assert loop.unpredicted == ()
-    trials, excess, _ = learn(problem, TwinTuner(loop, safety=Safety(start=tuple(problem.space.upper))), 4)
+    trials, excess, _ = learn(problem, TwinTuner(loop, safety=Safety(start=tuple(problem.space.upper))), 3)
     assert max(excess) <= 5.0
     assert max(t.score.excess["temperature_max_K"] for t in trials) <= 0.5
     assert max(t.score.excess["anode_min_V"] for t in trials) <= 5e-3
@@ -132,12 +132,11 @@ def test_a_safe_batch_is_of_different_thetas_that_all_passed():
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     trials, _, _ = learn(problem, tuner, 2)
     batch = tuner.ask(problem.space, trials, 3)
-    np.testing.assert_array_equal(batch[0], tuner.ask(problem.space, trials)[0])
     assert len(np.unique(batch, axis=0)) > 1
     belief, others_seed = believe(tuner.loop, trials), 12345
     for theta in batch:
-        # Other plants than those it was chosen by: three standard errors of a share of 400 below 0.95.
-        assert belief.predict(theta, 400, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 400) ** 0.5
+        # Other plants than those it was chosen by: three standard errors of a share of 200 below 0.95.
+        assert belief.predict(theta, 200, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 200) ** 0.5
     running = SimpleNamespace(number=2, theta=tuple(batch[0]), status="running", score=None, episode=None)
     np.testing.assert_array_equal(tuner.ask(problem.space, [*trials, running])[0], batch[1])
 
