@@ -92,3 +92,9 @@ def shared() -> Path:
     folder = Path(__file__).resolve().parents[2] / "shared"
     assert folder.is_dir(), f"{folder} is missing: the reference data belongs beside the checkout"
     return folder
+
+
+@pytest.fixture
+def virtual_machine(monkeypatch):
+    """Problems that run a few times are not worth a compilation, which takes as long as a hundred charges."""
+    monkeypatch.setenv("CHARGETUNE_CC", "none")

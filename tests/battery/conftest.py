@@ -40,9 +40,3 @@ def by_hand():
         iterations=np.ones(4, dtype=np.int64),
         ending=Ending.DONE,
     )
-
-
-@pytest.fixture
-def virtual_machine(monkeypatch):
-    """Problems that run once or twice are not worth a compilation."""
-    monkeypatch.setenv("CHARGETUNE_CC", "none")

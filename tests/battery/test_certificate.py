@@ -18,6 +18,8 @@ from chargetune.plants.sensors import Sensors
 from chargetune.study.evaluation import trial_seed
 from chargetune.verify import upper_bound, verify
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 NONE = Spread(0, 0, 0, 0, 0, 0)
 MODEST = Spread(soc_start=0.1, resistance=0.002, growth=0.0)

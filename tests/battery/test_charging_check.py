@@ -19,6 +19,8 @@ from chargetune.episode.perfect_model import check_formulation
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 EXAMPLES = Path(__file__).parents[2] / "examples"
 STUDIES = sorted(path for path in EXAMPLES.glob("*.toml") if not {"[ecm]", "[campaign]"} & set(path.read_text().split()))
@@ -80,7 +82,6 @@ PLANTED = {
 }  # fmt: skip
 
 
-@pytest.mark.usefixtures("virtual_machine")
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_error_is_found(name):
     changes, code, severity, words = PLANTED[name]
@@ -94,7 +95,6 @@ def test_a_planted_error_is_found(name):
     assert [f.severity for f in found] == sorted(f.severity for f in found)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_a_cell_warmer_than_its_limit_is_an_unsafe_start():
     warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1, ambient_K=320.0))
     found = check_charging(replace(problem(), plant_cell=warm, temperature_max_K=315.0), quick=True)
@@ -137,7 +137,6 @@ class Discharging:
         return SimulatedPlant(turned, start_state(CELL, soc_start), sensors)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_a_plant_with_the_other_sign_convention_is_found_by_the_whole_check():
     turned = short(plant_model=Discharging())
     found = [f for f in check_charging(turned) if f.code == "wrong-sign"]

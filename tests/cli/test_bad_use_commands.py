@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 STUDY = """
 [study]
 name = "NAME"

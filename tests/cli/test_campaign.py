@@ -4,9 +4,12 @@ import json
 import tomllib
 from pathlib import Path
 
+import pytest
 from commands import chargetune
 
 from chargetune.battery.campaign import load_campaign
+
+pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 STUDY = """

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 STUDY = """

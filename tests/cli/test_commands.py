@@ -143,7 +143,8 @@ def test_tune_resumes_shows_and_draws(tmp_path):
     done = chargetune("tune", path, "--out", tmp_path / "out")
     assert "6 trials" in done.stdout
     assert "resumed: 4 trials" in done.stderr
-    again = json.loads(chargetune("tune", path, "--out", tmp_path / "out", "--json").stdout)
+    (store,) = (tmp_path / "out").glob("*.sqlite")
+    again = json.loads(chargetune("tune", path, "--store", store, "--json").stdout)
     whole = json.loads(chargetune("tune", path, "--store", tmp_path / "whole.sqlite", "--json").stdout)
     assert again == whole
     assert whole["tuned"]["feasible"]

@@ -10,6 +10,8 @@ from commands import chargetune
 from chargetune.battery.cell import load_cell
 from chargetune.battery.config import load_config
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

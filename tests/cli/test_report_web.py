@@ -19,6 +19,8 @@ from report_studies import charging, other_study, run_charging
 
 from chargetune.cli import main
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 TOKEN = "correct horse battery"
 
 

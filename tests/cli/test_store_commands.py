@@ -12,6 +12,8 @@ import pytest
 from chargetune.cli import main
 from chargetune.study.salvage import salvage
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 QUICK = """
 [study]
 name = "red quick"

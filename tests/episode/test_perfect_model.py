@@ -15,11 +15,6 @@ from chargetune.model.model import Model, Signal
 from chargetune.model.parameters import Parameter, ParameterSpace
 
 
-@pytest.fixture
-def virtual_machine(monkeypatch):
-    monkeypatch.setenv("CHARGETUNE_CC", "none")
-
-
 @pytest.fixture(scope="module")
 def oracle():
     """The case study's controller with a measured overpotential, which knows the cell."""
