@@ -10,12 +10,13 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import told
 
 from chargetune.battery.cell import load_cell
 from chargetune.battery.charging import Backoff, ChargingProblem
 from chargetune.battery.electrochemical import Electrochemical
 from chargetune.learning import Sobol
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store import Store
 from chargetune.study.study import Study
 
 CONFIG = """
@@ -30,26 +31,22 @@ upper_V = 0.2
 """
 
 
-def told(path):
-    try:
-        with Store(path, read_only=True) as store:
-            return sum(t.status == "done" for r in store.studies() for t in store.trials(r.id))
-    except StoreError:
-        return 0
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_stops_and_resumes(tmp_path, number):
     (tmp_path / "s.toml").write_text(CONFIG)
     command = [sys.executable, "-m", "chargetune", "tune", str(tmp_path / "s.toml"), "--store", str(tmp_path / "s.db")]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    until = time.monotonic() + 60
-    while told(tmp_path / "s.db") < 3:
-        assert process.poll() is None
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    process.send_signal(number)
-    _, err = process.communicate(timeout=30)
+    try:
+        until = time.monotonic() + 60
+        while told(tmp_path / "s.db") < 3:
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+    finally:
+        # Whatever went wrong, it does not go on beside the tests that follow.
+        process.kill()
     assert process.returncode == 130
     assert "interrupted; the same command resumes" in err
     with Store(tmp_path / "s.db") as store:

@@ -1,3 +1,4 @@
+import itertools
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -141,7 +142,12 @@ def test_a_free_worker_is_given_a_new_theta_at_once(store):
 
 
 def test_a_theta_proposed_beside_pending_trials_can_be_found_again_from_the_record(store):
+    begun, three = itertools.count(), threading.Barrier(3)
+
     def evaluate(theta, seed):
+        if next(begun) < 3:
+            # However slow the machine, the third is proposed while two are running.
+            three.wait(timeout=60)
         threading.Event().wait(0.004 * (seed % 4))
         return Toy()(theta, seed)
 
