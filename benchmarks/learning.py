@@ -8,6 +8,7 @@ newest theta by the methods that learn from traces (safe, twin, ilc), the best t
 composite, the best that kept them as measured by the others. Attainable: the least t95 with at most 1 mV over the limit that
 envelope steps and SLSQP on the true plant find, computed here and kept in --cache; on a DFN plant envelope steps alone, and t80
 stands for t95 in every key. Where no theta keeps the limit, nothing is solved. A safe learner that knows no safe theta stops.
+ask_s is wall time, for which --workers 1 leaves both cores to the learner.
 """
 
 from __future__ import annotations
