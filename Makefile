@@ -31,7 +31,7 @@ demo: $(READY) ## tune a fast-charging controller and draw the figures, into out
 	$(BIN)/chargetune tune examples/fast_charge.toml --out out/demo
 
 test: lint types imports ## every check, then every test
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: $(READY) ## ruff: rules and format
 	$(BIN)/ruff check

@@ -53,7 +53,7 @@ def test_twenty_kills_change_nothing(tmp_path):
             time.sleep(rng.uniform(0.0, 0.1))
         else:
             # While it starts, so that some kills meet the first writes.
-            time.sleep(rng.uniform(0.5, 3.0))
+            time.sleep(rng.uniform(0.3, 2.0))
         if process.poll() is not None:
             # It came to its end: go on with a fresh study.
             for file in tmp_path.glob("killed.sqlite*"):

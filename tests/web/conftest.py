@@ -58,7 +58,7 @@ def open_page(chromium):
     """A function that opens an address in a fresh context and notes what goes wrong in it."""
     contexts = []
 
-    def run(address, width=1400, scheme="light", wait=None, watch=""):
+    def run(address, width=1400, scheme="light", wait=None):
         context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
         contexts.append(context)
         page = context.new_page()
@@ -67,7 +67,6 @@ def open_page(chromium):
         page.on("pageerror", lambda error: page.wrong.append(str(error)))
         page.on("console", lambda m: page.wrong.append(m.text) if m.type == "error" and EXPECTED not in m.text else None)
         page.on("dialog", lambda dialog: (page.wrong.append("a script of the store ran"), dialog.dismiss()))
-        page.add_init_script(watch)
         page.goto(address)
         if wait:
             page.wait_for_selector(wait, state="attached")
