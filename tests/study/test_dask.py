@@ -46,10 +46,13 @@ def test_a_worker_killed_in_the_middle_costs_nothing(store, tmp_path, client):
 
 def test_workers_of_a_cluster_never_wait(store, client):
     with open_study(store) as study, client.get_executor() as executor:
-        study.run(Toy(0.02), 12, executor=executor, workers=2)
+        study.run(Toy(0.2), 12, executor=executor, workers=2)
         trials = study.trials()
     assert [t.number for t in trials] == list(range(12))
-    assert {len(t.provenance["pending"]) for t in trials[1:]} == {1}
+    pending = [len(t.provenance["pending"]) for t in trials[1:]]
+    assert set(pending) <= {0, 1}
+    # Two may end at the same moment on a busy machine. Workers that waited for each other would see another at work in 6 of 11 only.
+    assert sum(pending) >= 8
 
 
 def test_a_plant_that_ends_the_worker_costs_one_trial(store, tmp_path, client):
