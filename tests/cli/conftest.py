@@ -1,40 +1,29 @@
-"""The command in the process of the tests, which is quicker than a new one."""
+"""The command in the process of the tests."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
-from chargetune.cli import main
-
 # So that the tests here find the module `commands`.
 sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture
-def chargetune_here(monkeypatch, capsys):
+def chargetune_here():
     """Run it: exit code, stdout, stderr."""
+    from commands import run
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["chargetune", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as ended:
-            code = ended.code or 0
-        else:
-            code = 0
-        return code, *capsys.readouterr()
+    def three(*arguments):
+        done = run(*arguments)
+        return done.returncode, done.stdout, done.stderr
 
-    return run
+    return three
 
 
 @pytest.fixture
-def refused(chargetune_here):
+def refused():
     """Run what is to be refused with exit code 2: stderr."""
+    from commands import chargetune
 
-    def run(*arguments):
-        code, _, err = chargetune_here(*arguments)
-        assert code == 2
-        return err
-
-    return run
+    return lambda *arguments: chargetune(*arguments, code=2).stderr

@@ -29,7 +29,7 @@ upper_V = 0.2
 
 def test_table_resume_and_json(tmp_path):
     (tmp_path / "one.toml").write_text(STUDY)
-    (tmp_path / "two.toml").write_text(STUDY.replace("60", "360"))
+    (tmp_path / "two.toml").write_text(STUDY.replace("60", "120"))
     path = tmp_path / "all.toml"
     path.write_text('[campaign]\nconfigs = ["one.toml", "two.toml"]\nseeds = "0:2"\n')
     store = tmp_path / "s.sqlite"

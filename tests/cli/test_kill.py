@@ -2,14 +2,14 @@
 
 import json
 import random
-import signal
-import subprocess
-import sys
 import time
+from multiprocessing import get_context
 
-from commands import told
+from commands import chargetune, run, told
 
 KILLS = 20
+# Of this process, which has imported everything: twenty starts of Python would take most of the time.
+FORK = get_context("fork")
 CONFIG = """
 [study]
 name = "killed"
@@ -27,41 +27,39 @@ upper_V = 0.2
 
 
 def command(config, store):
-    return [sys.executable, "-m", "chargetune", "tune", str(config), "--store", str(store), "--json"]
+    return "tune", config, "--store", store, "--json"
 
 
-def trials(config, store):
-    done = subprocess.run(
-        [sys.executable, "-m", "chargetune", "show", str(store), "--study", "killed", "--json"], capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout)["trials"]
+def trials(store):
+    return json.loads(chargetune("show", store, "--study", "killed", "--json").stdout)["trials"]
 
 
 def test_twenty_kills_change_nothing(tmp_path):
-    config = tmp_path / "killed.toml"
+    config, store = tmp_path / "killed.toml", tmp_path / "killed.sqlite"
     config.write_text(CONFIG)
-    whole = subprocess.run(command(config, tmp_path / "whole.sqlite"), capture_output=True, text=True, check=True)
+    whole = chargetune(*command(config, tmp_path / "whole.sqlite"))
     rng = random.Random(0)  # noqa: S311 - moments of a test, no secret
     kills = 0
     while kills < KILLS:
-        before = told(tmp_path / "killed.sqlite")
-        process = subprocess.Popen(command(config, tmp_path / "killed.sqlite"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        before = told(store)
+        process = FORK.Process(target=run, args=command(config, store))
+        process.start()
         if kills % 2:
             # While trials are written, however long starting took.
-            while process.poll() is None and told(tmp_path / "killed.sqlite") == before:
+            while process.is_alive() and told(store) == before:
                 time.sleep(0.01)
             time.sleep(rng.uniform(0.0, 0.1))
         else:
             # While it starts, so that some kills meet the first writes.
-            time.sleep(rng.uniform(0.3, 2.0))
-        if process.poll() is not None:
+            time.sleep(rng.uniform(0.0, 1.0))
+        if not process.is_alive():
             # It came to its end: go on with a fresh study.
             for file in tmp_path.glob("killed.sqlite*"):
                 file.unlink()
             continue
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        process.kill()
+        process.join()
         kills += 1
-    again = subprocess.run(command(config, tmp_path / "killed.sqlite"), capture_output=True, text=True, check=True)
+    again = chargetune(*command(config, store))
     assert json.loads(again.stdout) == json.loads(whole.stdout)
-    assert trials(config, tmp_path / "killed.sqlite") == trials(config, tmp_path / "whole.sqlite")
+    assert trials(store) == trials(tmp_path / "whole.sqlite")

@@ -80,6 +80,26 @@ class Deadly:
         return Toy()(theta, seed)
 
 
+@dataclass(frozen=True)
+class Waits:
+    """The toy, but trial ``first`` of the toy's study ends only when trial ``later`` has begun, in whatever process."""
+
+    first: int
+    later: int
+    begun: Path
+
+    def __call__(self, theta, seed):
+        if seed == trial_seed(SEED, self.later):
+            self.begun.touch()
+        if seed == trial_seed(SEED, self.first):
+            until = time.monotonic() + 60
+            while not self.begun.exists():
+                if time.monotonic() > until:
+                    raise RuntimeError(f"trial {self.later} does not begin beside trial {self.first}")
+                time.sleep(0.01)
+        return Toy()(theta, seed)
+
+
 class OnlyHere:
     """Pickles, and cannot be unpickled."""
 

@@ -119,6 +119,9 @@ def test_workers_have_one_thread_ignore_ctrl_c_and_this_process_keeps_its_own_se
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with process_executor(2) as pool:
         found = list(pool.map(environment, range(4)))
+        # The first to have started may have taken them all.
+        while len({process for *_, process in found}) < 2:
+            found += pool.map(environment, range(2))
     assert {threads for threads, *_ in found} == {"1"}
     assert {on_ctrl_c for _, on_ctrl_c, _ in found} == {signal.SIG_IGN}
     assert len({process for *_, process in found}) == 2

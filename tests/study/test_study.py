@@ -135,8 +135,8 @@ def test_a_free_worker_is_given_a_new_theta_at_once(store):
         study.run(evaluate, 9, executor=pool, workers=3, progress=lambda trial, *_: told.append(trial.number))
         trials = study.trials()
     assert sorted(told) == list(range(9))
-    assert told.index(0) >= 4
-    assert [t.provenance["pending"] for t in trials[:3]] == [[], [0], [0, 1]]
+    assert told.index(0) >= 3
+    assert [t.provenance["pending"] for t in trials[:2]] == [[], [0]]
     assert all(0 in t.provenance["pending"] for t in trials[1:6])
     assert all(len(t.provenance["pending"]) <= 2 for t in trials)
 
@@ -163,11 +163,10 @@ def test_a_theta_proposed_beside_pending_trials_can_be_found_again_from_the_reco
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_ctrl_c_among_workers_and_going_on(store, workers):
-    calls = []
+    calls = itertools.count(1)
 
     def interrupted(theta, seed):
-        calls.append(seed)
-        if len(calls) in {4, 11}:
+        if next(calls) in {4, 11}:
             raise KeyboardInterrupt
         return Toy()(theta, seed)
 
@@ -201,11 +200,10 @@ def test_stopping_within_a_batch_and_going_on_is_one_study(store, tmp_path):
 @pytest.mark.parametrize("batch", [1, 4])
 @pytest.mark.parametrize("workers", [None, 2])
 def test_ctrl_c_stops_and_the_same_call_resumes(store, tmp_path, batch, workers):
-    calls = []
+    calls = itertools.count(1)
 
     def interrupted(theta, seed):
-        calls.append(seed)
-        if len(calls) in {3, 9, 10}:
+        if next(calls) in {3, 9, 10}:
             raise KeyboardInterrupt
         return Toy()(theta, seed)
 
