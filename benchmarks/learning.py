@@ -4,8 +4,8 @@
 
 A row is one method after one number of trials. Solved: the true, noise-free excess of the theta that the learner recommends
 is at most 1 mV, any other limit kept within its tolerance, and its t95 within 1.05 of the attainable one. Recommended is the
-newest theta by the methods that learn from traces (safe, twin, ilc), the best that its processes believe to keep the limits by
-composite, the best that kept them as measured by the others. Attainable: the least t95 with at most 1 mV over the limit that
+best that is believed to keep the limits by twin and composite (their `best`), the newest theta by safe and ilc, the best
+that kept the limits as measured by the others. Attainable: the least t95 with at most 1 mV over the limit that
 envelope steps and SLSQP on the true plant find, computed here and kept in --cache; on a DFN plant envelope steps alone, and t80
 stands for t95 in every key. Where no theta keeps the limit, nothing is solved. A safe learner that knows no safe theta stops.
 ask_s is wall time, for which --workers 1 leaves both cores to the learner.
@@ -41,7 +41,7 @@ from chargetune.learning.tuner import sobol_points
 from chargetune.learning.twin_search import Search
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0
-FROM_TRACES = ("safe", "twin", "ilc")
+NEWEST, BELIEVED = ("safe", "ilc"), ("twin", "composite")
 
 
 def _safe(problem: Any, seed: int) -> Any:
@@ -141,9 +141,9 @@ def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int
 
 
 def _recommended(method: str, tuner: Any, problem: Any, told: list[Any]) -> int:
-    if method in FROM_TRACES:
+    if method in NEWEST:
         return len(told) - 1
-    if method == "composite":
+    if method in BELIEVED:
         best = tuner.best(problem.space, told)
     else:
         trial = tuned_trial(told, "default")

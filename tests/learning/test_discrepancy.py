@@ -75,7 +75,7 @@ def test_the_scale_grows_with_what_was_not_foretold():
     for pairs in (False, True):
         problem = charge(pairs=pairs)
         before, _ = beliefs(problem, (4.0,))
-        scales.append(before.discrepancy.foretold(problem.episode(np.full(9, 1.6), 7))[0])
+        scales.append(before.discrepancy.foretold([problem.episode(np.full(9, 1.6), 7)])[0])
     assert scales[0] < 2.0 < scales[1]
 
 

@@ -11,6 +11,7 @@ from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
+from chargetune.learning.belief import believe
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -156,6 +157,22 @@ def test_three_trials_are_enough():
     # 36.7 min is what 4000 evaluations of CMA-ES reach on this plant.
     assert metrics["t95_min"] <= 1.05 * 36.7
     np.testing.assert_array_equal(tuner.ask(noisy.space, trials[:2])[0], trials[2].theta)
+    assert [tuner.best(noisy.space, trials[:n]) for n in range(4)] == [None, 0, 1, 2]
+
+
+def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
+    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    theta, trials = problem.space.default, []
+    for number in range(2):
+        score, episode, _ = problem(theta * (1.0 + number), number)
+        trials.append(
+            SimpleNamespace(number=number, theta=tuple(theta * (1.0 + number)), status="done", score=score, episode=lambda e=episode: e)
+        )
+    tuner = TwinTuner(ChargingTwin(problem))
+    belief = believe(tuner.loop, trials)
+    two, *_, three, _, none = (predicted.probability() for _, predicted in tuner._cautious(belief, theta, 3))
+    assert none < 0.5
+    assert 0.8 < two <= three
 
 
 def test_without_a_trace_the_design_is_theta_0_and_sobol():

@@ -21,8 +21,9 @@ from chargetune.learning.twin import Twin
 __all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
-TRACES_MAX = 5
-
+TRACES_MAX = 4
+# By how many of them those before are judged: one may go where all is known already, and says nothing of the next.
+FORETOLD = 2
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
 """thetas -> the episode of each on one simulated plant, None where it fails."""
@@ -66,7 +67,7 @@ class TwinLoop(EnvelopeLoop, Protocol):
 class Belief:
     """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
 
-    ``mistake``: how wrong those before it were about the newest trial (`Discrepancy.foretold`); 0 before two are known.
+    ``mistake``: how wrong those before them were about the newest trials (`Discrepancy.foretold`); 0 before two are known.
     """
 
     loop: TwinLoop
@@ -192,9 +193,10 @@ def believe(loop: TwinLoop, trials: Sequence[TrialLike]) -> Belief:
     episodes = tuple(episodes_of(trials, TRACES_MAX))
     scale, mistake, guess = 1.0, 0.0, None
     if len(episodes) > 1:
-        # How well the newest trial was foretold by those before it is how far its own successor can be trusted.
-        before = loop.twin.fit(episodes[:-1])
+        # How well the newest trials were foretold by those before them is how far their successor can be trusted.
+        known = max(1, len(episodes) - FORETOLD)
+        before = loop.twin.fit(episodes[:known])
         guess = before.mode
-        scale, mistake = Discrepancy(before, episodes[:-1], loop.features).foretold(episodes[-1])
+        scale, mistake = Discrepancy(before, episodes[:known], loop.features).foretold(episodes[known:])
     posterior = loop.twin.fit(episodes, guess=guess)
     return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None, mistake)

@@ -52,19 +52,18 @@ def most_promising(
     reproduces the trial that it was made from. Source of the acquisition: Ament et al., NeurIPS 2023.
     """
     seen = [t for t in trials if t.score is not None]
-    foretold = belief.scores([*(theta for theta, _ in candidates), *(np.array(t.theta) for t in seen)])
-    known = [(c, s) for c, s in zip(candidates, foretold, strict=False) if s is not None and c[1].scores]
-    done = [(t, s) for t, s in zip(seen, foretold[len(candidates) :], strict=True) if s is not None]
+    known = [c for c in candidates if c[1].scores]
+    done = [(t, s) for t, s in zip(seen, belief.scores([np.array(t.theta) for t in seen]), strict=True) if s is not None]
     if len(known) < 2 or len(done) < PROVED:
-        return known[0][0] if known else candidates[0]
+        return (known or list(candidates))[0]
     failed = [t.theta for t in trials if t.score is None and t.status != "running"]
     with reproducible(seed):
         model = _Corrected(space, done, known)
         away = torch.as_tensor(space.to_unit(np.array(failed).reshape(-1, space.dimension)))
-        points = torch.as_tensor(space.to_unit(np.array([theta for (theta, _), _ in known])))
+        points = torch.as_tensor(space.to_unit(np.array([theta for theta, _ in known])))
         with torch.no_grad():
             values = AwayFromFailures(model.acquisition(), away)(points[:, None, :])
-        return known[int(torch.nan_to_num(values, nan=-torch.inf).argmax())][0]
+        return known[int(torch.nan_to_num(values, nan=-torch.inf).argmax())]
 
 
 class _Corrected(Model):
@@ -73,26 +72,29 @@ class _Corrected(Model):
     Known at the thetas of the trials and of the candidates, nowhere else.
     """
 
-    def __init__(self, space: ParameterSpace, done: Sequence[tuple[TrialLike, Score]], known: Sequence[tuple[Candidate, Score]]) -> None:
+    def __init__(self, space: ParameterSpace, done: Sequence[tuple[TrialLike, Score]], known: Sequence[Candidate]) -> None:
         super().__init__()
-        scores = [t.score for t, _ in done if t.score is not None]
-        measured = np.array([_values(s) for s in scores])
-        foretold = np.array([_values(s) for _, s in (*done, *known)])
+        measured = np.array([_values(t.score) for t, _ in done if t.score is not None])
+        ensembles = [np.array([_values(s) for s in predicted.scores]) for _, predicted in known]
+        # A trial is known, and the expected episode says it all; of a candidate the worst of many windows is worse than the expected one.
+        foretold = np.array([*(_values(s) for _, s in done), *(e.mean(axis=0) for e in ensembles)])
         scale = np.sqrt(np.mean((measured - foretold[: len(done)]) ** 2, axis=0))
         scale = np.maximum(scale, LEAST * np.max(np.abs(foretold), axis=0)) + np.finfo(float).tiny
         # A limit that nothing comes near has the probability 1, and needs no process to say so.
         near = np.max(np.vstack([measured, foretold]) / scale, axis=0) > -FAR
         near[0] = True
         measured, foretold, scale = measured[:, near], foretold[:, near], scale[near]
-        points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for (theta, _), _ in known)]))
+        points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for theta, _ in known)]))
         x, y = torch.as_tensor(points[: len(done)]), torch.as_tensor(measured / scale)
         self._model = ModelListGP(
             *(GaussianProcess(mean=_table(points, foretold[:, i] / scale[i]), standardise=False).fit(x, y[:, i]) for i in range(len(scale)))
         )
-        spread = np.array([np.std([_values(s) for s in c[1].scores], axis=0) for c, _ in known])[:, near]
+        spread = np.array([e.std(axis=0) for e in ensembles])[:, near]
         self._spread = [_table(points[len(done) :], spread[:, i] / scale[i])() for i in range(len(scale))]
-        kept = [s.objective for s in scores if s.feasible]
-        self._best = max(kept) / scale[0] if kept else None
+        with torch.no_grad():
+            mean, _ = marginals(self._model, x[:, None, :])
+        kept = mean[(mean[:, 1:] <= 0.0).all(dim=-1), 0]
+        self._best = float(kept.max()) if len(kept) else None
 
     @property
     def num_outputs(self) -> int:

@@ -87,15 +87,27 @@ class Discrepancy:
         each(lambda part: part.root, self._parts)
         return each(self.error, unknowns, seeds)
 
-    def foretold(self, episode: Episode) -> tuple[float, float]:
-        """(scale, mistake) of the prediction of one episode that was not learnt from, at its recorded input.
+    def foretold(self, episodes: Sequence[Episode]) -> tuple[float, float]:
+        """(scale, mistake) of the prediction of episodes that were not learnt from, at their recorded inputs.
 
         Scale: how many times larger than stated the discrepancy is where nothing was measured. Mistake: root mean square of what
-        the prediction was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
-        The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episode, at
+        the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
+        The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episodes, at
         the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
         Neighbouring stretches err together, so `TOGETHER` of them count as one.
         """
+        scales = np.geomspace(0.1, 10.0, 61)
+        chance, mistake = -0.5 * np.log(scales) ** 2, 0.0
+        stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
+        for episode in episodes:
+            square, unmodelled, rest, known = self._off(episode)
+            variance = scales[:, None] ** 2 * unmodelled[known] + rest[known]
+            chance = chance - 0.5 * np.sum(np.log(variance) + square[known] / variance, axis=1) / TOGETHER
+            mistake = float(np.sqrt(np.mean((square / (rest + stated**2))[known]))) if known.any() else 0.0
+        return float(scales[np.argmax(chance)]), mistake
+
+    def _off(self, episode: Episode) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """By stretch and output: squared error of the prediction, its variance by the discrepancy and by all else, whether measured."""
         posterior, twin = self.posterior, self.posterior.twin
         predicted = twin.predict(posterior.mode, episode.input)
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
@@ -107,14 +119,7 @@ class Discrepancy:
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
         spread = self._table(np.stack([part.variance for part in self._parts]))
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
-        known = (counts > 0) & np.isfinite(left)
-        square, unmodelled, rest = left[known] ** 2, spread(self._at(episode))[known], rest[known]
-        scales = np.geomspace(0.1, 10.0, 61)
-        variance = scales[:, None] ** 2 * unmodelled + rest
-        chance = -0.5 * np.sum(np.log(variance) + square / variance, axis=1) / TOGETHER - 0.5 * np.log(scales) ** 2
-        stated = np.array([twin.error_sd.get(name, 0.0) for name in twin.noise_sd])
-        mistake = np.sqrt(np.mean(square / (rest + np.broadcast_to(stated**2, left.shape)[known]))) if known.any() else 0.0
-        return float(scales[np.argmax(chance)]), float(mistake)
+        return left**2, spread(self._at(episode)), rest, (counts > 0) & np.isfinite(left)
 
     def _table(self, values: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
         """Values at the nodes, shape (outputs, nodes) -> (features (K, n) -> values (K, outputs)), linear in between, held beyond."""

@@ -29,8 +29,7 @@ FAR = -1.0
 class Search:
     """Verdicts on the episodes of one plant by point of the unit cube, remembered.
 
-    ``margin`` is added to the excess of each window, in tolerances. ``known``: the verdicts that
-    another search on the same plant knows, shared with it; they are looked up and are none of this search's own points.
+    ``margin`` is added to the excess of each window, in tolerances.
     """
 
     def __init__(
@@ -39,11 +38,9 @@ class Search:
         simulate: Simulate,
         space: ParameterSpace,
         margin: NDArray[np.float64] | float = 0.0,
-        known: dict[bytes, Score | None] | None = None,
     ) -> None:
         self._loop, self._simulate, self._space, self._margin = loop, simulate, space, margin
         self._seen: dict[bytes, Score | None] = {}
-        self.known: dict[bytes, Score | None] = {} if known is None else known
         self._slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._unit = (1.0, 1.0)
 
@@ -52,12 +49,11 @@ class Search:
 
     def scores(self, points: Sequence[NDArray[np.float64]]) -> list[Score | None]:
         """Verdicts at several points, simulated together."""
-        fresh = list({u.tobytes(): u for u in points if u.tobytes() not in self.known}.values())
+        fresh = list({u.tobytes(): u for u in points if u.tobytes() not in self._seen}.values())
         episodes = self._simulate([self._space.from_unit(np.clip(u, 0.0, 1.0)) for u in fresh]) if fresh else []
         for u, episode in zip(fresh, episodes, strict=True):
-            self.known[u.tobytes()] = None if episode is None else self._loop.score(episode)
-        self._seen |= {u.tobytes(): self.known[u.tobytes()] for u in points}
-        return [self.known[u.tobytes()] for u in points]
+            self._seen[u.tobytes()] = None if episode is None else self._loop.score(episode)
+        return [self._seen[u.tobytes()] for u in points]
 
     def envelope(self, start: NDArray[np.float64], iterations: int) -> None:
         """From ``start``, ``iterations`` times the theta whose predictions cover what the plant did last; all are remembered."""
@@ -99,17 +95,20 @@ class Search:
         value, excess = self._values(u)
         return float(value + PENALTY * np.sum(np.maximum(excess, 0.0)))
 
-    def best(self) -> NDArray[np.float64]:
-        """The seen point of the best objective that keeps the limits, else that of the least worst excess."""
+    def best(self, start: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """The seen point of the best objective that keeps the limits, or breaks them as little as ``start``; else of the least excess."""
+        allowed = 0.0 if start is None else max(0.0, self._worst(self.score(start)))
 
         def rank(key: bytes) -> tuple[bool, float]:
             score = self._seen[key]
-            if score is None:
-                return True, np.inf
-            worst = float(np.nanmax(windows_of(score, ACCEPTED) + self._margin, initial=-np.inf))
-            return worst > 0, -score.objective if worst <= 0 else worst
+            worst = self._worst(score)
+            return worst > allowed, -score.objective if score is not None and worst <= allowed else worst
 
         return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
+
+    def _worst(self, score: Score | None) -> float:
+        """Of the windows, in tolerances; inf where there is no episode."""
+        return np.inf if score is None else float(np.nanmax(windows_of(score, ACCEPTED) + self._margin, initial=-np.inf))
 
     def _values(self, u: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """(objective to be minimised, excess beyond what is aimed at, of every window; -inf where none was visited), scaled."""

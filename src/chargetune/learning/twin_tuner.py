@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
-from chargetune.episode.score import Score
 from chargetune.learning.belief import Belief, Prediction, TwinLoop, believe, episodes_of, windows_of
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.corrected import Candidate, most_promising
@@ -28,8 +27,9 @@ __all__ = ["TwinTuner"]
 
 # Times more wrong than allowed for, at which a twin is none.
 MISTAKEN = 3.5
-# Plants of an ensemble; the standard error of a probability of 0.95 is 0.027.
-DRAWS = 48
+# Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has foretold a trial:
+# its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
+DRAWS, DRAWS_UNPROVED = 32, 64
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one.
@@ -38,17 +38,17 @@ SETTLED = 2e-3
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.5
-# Standard deviations that may be taken back where nothing is promised, the first unless the acquisition prefers another. With none
-# half of the plants would break a limit; where one or none were allowed, 3 and 5 of 120 trials did by more than 1 mV (decision 0010).
+# Standard deviations that are taken back where nothing is promised; the acquisition chooses, none among them.
 CAUTION = (2.0, 3.0)
+# Envelope steps that take them back.
+STEPS_BACK = 2
 # Factor on the deviations where that does not suffice.
 WIDER = 1.25
 # Two starts that are closer than this share of the range in every entry lead to one end.
 APART = 0.1
 # Iterations of the search that ends it.
 POLISHING = 8
-# Of a limit's tolerance, what the upper side of the prediction may use: in safe mode, and where nothing is promised. A charge ends at
-# its limit, and what is kept back there costs most: a quarter of a millivolt was 4 % of the time to 95 %.
+# Of a limit's tolerance, what the upper side of the prediction may use: in safe mode, and where nothing is promised.
 AIMED, AIMED_UNSAFE = 0.5, 0.75
 
 
@@ -56,12 +56,13 @@ AIMED, AIMED_UNSAFE = 0.5, 0.75
 class TwinTuner:
     """First theta_0; then the theta that is best on the plant as the traces so far show it.
 
-    Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). Candidates solve max objective s.t.
-    excess + sd <= tolerance, in every window where the score has a profile, on the simulated closed loop with the twin at its
-    posterior mode plus the mean discrepancy (`Search`), for several sd of an ensemble (`CAUTION`); searched from theta_0, ``pool``
-    Sobol points and the thetas tried so far. Constrained log expected improvement, on m corrected by the Gaussian process of what the
-    trials left of it, picks one (`most_promising`). Further thetas of a batch, and those proposed beside running trials, are best
-    on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the design is Sobol's.
+    Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). One candidate solves max objective s.t.
+    excess <= tolerance, in every window where the score has a profile, on the simulated closed loop with the twin at its posterior
+    mode plus the mean discrepancy (`Search`), searched from theta_0, ``pool`` Sobol points and the thetas tried so far. Envelope steps
+    from there, by several sd of an ensemble (`CAUTION`), give the others. Constrained log expected improvement, on m corrected by the
+    Gaussian process of what the trials left of it, picks one (`most_promising`). Further thetas of a batch, and those proposed beside
+    running trials, are best on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the
+    design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
@@ -79,7 +80,7 @@ class TwinTuner:
     safety: Safety | None = None
     pool: int = 32
     steps: int = 5
-    iterations: int = 15
+    iterations: int = 10
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
         """``n`` thetas, shape (n, d). Raises ValueError when n is no count, `NoSafeThetaError`."""
@@ -117,11 +118,27 @@ class TwinTuner:
         if pending:
             return np.array(thetas)
         seed = self.seed + 7919 * len(trials)
-        predicted = belief.predict(thetas[0], DRAWS, seed)
-        cautious = [self._polished(space, belief, thetas[0], predicted, sd, searches[0].known, AIMED_UNSAFE) for sd in CAUTION]
-        candidates = [(theta, belief.predict(theta, DRAWS, seed)) for theta in cautious]
-        best, _ = most_promising(belief, space, trials, candidates, seed)
+        best, _ = most_promising(belief, space, trials, self._cautious(belief, thetas[0], seed), seed)
         return np.array([best, *thetas[1:]])
+
+    def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
+        """Index of the trial that is believed best: the best objective expected of those that keep every limit more likely than not.
+
+        No single measurement decides whether it kept them, all traces do; where none is likely to, the likeliest. None without traces.
+        """
+        with threadpool_limits(1):
+            belief = believe(self.loop, trials)
+            if belief.discrepancy is None:
+                return None
+            seed = self.seed + 7919 * len(trials)
+            predicted = {k: _predicted(belief, np.array(t.theta), seed) for k, t in enumerate(trials) if t.score is not None}
+
+        def rank(k: int) -> tuple[float, float]:
+            scores = predicted[k].scores
+            objective = float(np.mean([s.objective for s in scores])) if scores else -np.inf
+            return min(predicted[k].probability(), 0.5), objective
+
+        return max(predicted, key=rank, default=None)
 
     def _points(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> list[NDArray[np.float64]]:
         """Where a search may begin: theta_0, Sobol's points, the thetas tried so far, the last one last."""
@@ -152,7 +169,7 @@ class TwinTuner:
         theta = self._covered(belief, np.array(trials[-1].theta))
         passed: list[tuple[float, Candidate]] = []
         for k in range(ROUNDS):
-            expected, predicted = belief.central(theta), belief.predict(theta, DRAWS, seed)
+            expected, predicted = belief.central(theta), _predicted(belief, theta, seed)
             score = None if expected is None else self.loop.score(expected)
             rows = predicted.upper_rows(deviations)
             if expected is None or score is None or rows is None:
@@ -171,7 +188,7 @@ class TwinTuner:
         candidates = [one for _, one in sorted(passed, key=lambda one: -one[0])]
         if belief.proved:
             polished = self._polished(space, belief, *candidates[0], deviations)
-            predicted = belief.predict(polished, DRAWS, seed)
+            predicted = _predicted(belief, polished, seed)
             if predicted.probability() >= safety.probability:
                 candidates.insert(0, (polished, predicted))
         theta, predicted = most_promising(belief, space, trials, candidates, seed)
@@ -180,7 +197,7 @@ class TwinTuner:
         upper, search = predicted.upper_windows(deviations), Search(self.loop, belief.expected, space)
         for shares in ((1.0, 0.5), (0.5,), (0.25,)) if (known := _kept(trials)) else ():
             nearer = way_back(search, space, known[0], theta, upper, shares)
-            if belief.predict(nearer, DRAWS, seed).probability() >= safety.probability:
+            if _predicted(belief, nearer, seed).probability() >= safety.probability:
                 return [nearer, *others]
         return [theta, *others]
 
@@ -191,20 +208,32 @@ class TwinTuner:
         theta: NDArray[np.float64],
         predicted: Prediction,
         deviations: float,
-        known: dict[bytes, Score | None] | None = None,
-        aimed: float = AIMED,
     ) -> NDArray[np.float64]:
         """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
         expected = belief.central(theta)
         score = None if expected is None else self.loop.score(expected)
         if score is None:
             return theta
-        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - aimed)
-        search = Search(self.loop, belief.expected, space, np.nan_to_num(margin), known)
+        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
+        search = Search(self.loop, belief.expected, space, np.nan_to_num(margin))
         start = space.to_unit(theta)
         search.scale([start, space.to_unit(space.default)])
         search.refine(start, POLISHING)
-        return space.from_unit(search.best())
+        return space.from_unit(search.best(start))
+
+    def _cautious(self, belief: Belief, theta: NDArray[np.float64], seed: int) -> list[Candidate]:
+        """From the best theta on the expected plant envelope steps that take back some sd; all of them, that theta last."""
+        start, out = (theta, _predicted(belief, theta, seed)), []
+        for deviations in CAUTION:
+            at, predicted = start
+            for _ in range(STEPS_BACK):
+                expected, rows = belief.central(at), predicted.upper_rows(deviations)
+                if expected is None or rows is None:
+                    break
+                at = covering(self.loop.controller, expected, at, rows - AIMED_UNSAFE * self.loop.row_tolerances)
+                predicted = _predicted(belief, at, seed)
+                out.append((at, predicted))
+        return [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1], start]
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Envelope steps on the plant that is expected."""
@@ -220,7 +249,7 @@ class TwinTuner:
     def _tried(self, trials: Sequence[TrialLike], belief: Belief, safety: Safety, seed: int) -> NDArray[np.float64]:
         """The best theta that was tried, kept the limits, and is still predicted to."""
         for theta in _kept(trials):
-            if belief.predict(theta, DRAWS, seed).probability() >= safety.probability:
+            if _predicted(belief, theta, seed).probability() >= safety.probability:
                 warnings.warn("no safe improvement is known: a theta that was tried is proposed again", RuntimeWarning, stacklevel=2)
                 return theta
         what = f"no theta keeps every limit with probability {safety.probability:g}"
@@ -238,7 +267,7 @@ class TwinTuner:
         if safety.start is not None:
             return space.validate(np.array(safety.start))
         corners = [np.concatenate(parts) for parts in product(*([np.zeros(p.size), np.ones(p.size)] for p in space.parameters))]
-        predictions = [belief.predict(space.from_unit(u), DRAWS, self.seed) for u in corners]
+        predictions = [_predicted(belief, space.from_unit(u), self.seed) for u in corners]
         chances = [p.probability() for p in predictions]
         worst = [float(np.nanquantile(np.nanmax(p.excess, axis=1), safety.probability)) if len(p.excess) else np.inf for p in predictions]
         at = min(range(len(corners)), key=lambda i: (-chances[i], worst[i]))
@@ -248,6 +277,10 @@ class TwinTuner:
                 f"(the most cautious one: {chances[at]:.2f}); declare a start that does"
             )
         return space.from_unit(corners[at])
+
+
+def _predicted(belief: Belief, theta: NDArray[np.float64], seed: int) -> Prediction:
+    return belief.predict(theta, DRAWS if belief.proved else DRAWS_UNPROVED, seed)
 
 
 def _moved(space: ParameterSpace, before: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
