@@ -170,9 +170,25 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
         )
     tuner = TwinTuner(ChargingTwin(problem))
     belief = believe(tuner.loop, trials)
-    two, *_, three, _, none = (predicted.probability() for _, predicted in tuner._cautious(belief, theta, 3))
-    assert none < 0.5
-    assert 0.8 < two <= three
+    chances = [predicted.probability() for _, predicted in tuner._cautious(belief, theta, 3)]
+    assert belief.predict(theta, 64, 3).probability() < 0.5
+    assert chances[0] > 0.8
+    assert min(chances) >= 0.5
+
+
+def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first():
+    """The plant overshoots by 60 mV, and an R1 within 1 % cannot change that."""
+    problem = charge(ratios=(ResistanceRatio("R1", 0.99, 1.01),))
+    theta, trials = problem.space.default, []
+    for number in range(2):
+        score, episode, _ = problem(theta, number)
+        trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
+    tuner = TwinTuner(ChargingTwin(problem))
+    found = tuner._cautious(believe(tuner.loop, trials), theta, 3)
+    chances = [predicted.probability() for _, predicted in found]
+    assert chances[0] < 0.5
+    assert chances == sorted(chances, reverse=True)
+    assert any(np.array_equal(theta, other) for other, _ in found)
 
 
 def test_without_a_trace_the_design_is_theta_0_and_sobol():

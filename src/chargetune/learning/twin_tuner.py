@@ -48,8 +48,8 @@ WIDER = 1.25
 APART = 0.1
 # Iterations of the search that ends it.
 POLISHING = 8
-# Of a limit's tolerance, what the upper side of the prediction may use: in safe mode, and where nothing is promised.
-AIMED, AIMED_UNSAFE = 0.5, 0.75
+# Of a limit's tolerance, what the upper side of the prediction may use.
+AIMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class TwinTuner:
         return space.from_unit(search.best(start))
 
     def _cautious(self, belief: Belief, theta: NDArray[np.float64], seed: int) -> list[Candidate]:
-        """From the best theta on the expected plant envelope steps that take back some sd; all of them, that theta last."""
+        """From the best theta on the expected plant envelope steps that take back some sd; it too where none is likely to do."""
         start, out = (theta, _predicted(belief, theta, seed)), []
         for deviations in CAUTION:
             at, predicted = start
@@ -230,10 +230,14 @@ class TwinTuner:
                 expected, rows = belief.central(at), predicted.upper_rows(deviations)
                 if expected is None or rows is None:
                     break
-                at = covering(self.loop.controller, expected, at, rows - AIMED_UNSAFE * self.loop.row_tolerances)
+                at = covering(self.loop.controller, expected, at, rows - AIMED * self.loop.row_tolerances)
                 predicted = _predicted(belief, at, seed)
                 out.append((at, predicted))
-        return [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1], start]
+        ordered = [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1]]
+        likely = [one for one in ordered if one[1].probability() >= 0.5]
+        # From a search that failed the steps lead to where the ensemble itself says that a limit breaks, and some limits they cannot
+        # keep: then nothing is taken back, where that is likelier to keep them.
+        return likely or sorted([*ordered, start], key=lambda one: -one[1].probability())
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Envelope steps on the plant that is expected."""
