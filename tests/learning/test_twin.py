@@ -170,7 +170,7 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
         )
     tuner = TwinTuner(ChargingTwin(problem))
     belief = believe(tuner.loop, trials)
-    chances = [predicted.probability() for _, predicted in tuner._cautious(belief, theta, 3)]
+    chances = [predicted.probability() for _, predicted in tuner._cautious(problem.space, belief, theta, 3)]
     assert belief.predict(theta, 64, 3).probability() < 0.5
     assert chances[0] > 0.8
     assert min(chances) >= 0.5
@@ -184,7 +184,7 @@ def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first
         score, episode, _ = problem(theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
     tuner = TwinTuner(ChargingTwin(problem))
-    found = tuner._cautious(believe(tuner.loop, trials), theta, 3)
+    found = tuner._cautious(problem.space, believe(tuner.loop, trials), theta, 3)
     chances = [predicted.probability() for _, predicted in found]
     assert chances[0] < 0.5
     assert chances == sorted(chances, reverse=True)

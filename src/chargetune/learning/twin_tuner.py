@@ -118,7 +118,7 @@ class TwinTuner:
         if pending:
             return np.array(thetas)
         seed = self.seed + 7919 * len(trials)
-        best, _ = most_promising(belief, space, trials, self._cautious(belief, thetas[0], seed), seed)
+        best, _ = most_promising(belief, space, trials, self._cautious(space, belief, thetas[0], seed), seed)
         return np.array([best, *thetas[1:]])
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
@@ -221,7 +221,7 @@ class TwinTuner:
         search.refine(start, POLISHING)
         return space.from_unit(search.best(start))
 
-    def _cautious(self, belief: Belief, theta: NDArray[np.float64], seed: int) -> list[Candidate]:
+    def _cautious(self, space: ParameterSpace, belief: Belief, theta: NDArray[np.float64], seed: int) -> list[Candidate]:
         """From the best theta on the expected plant envelope steps that take back some sd; it too where none is likely to do."""
         start, out = (theta, _predicted(belief, theta, seed)), []
         for deviations in CAUTION:
@@ -237,7 +237,10 @@ class TwinTuner:
         likely = [one for one in ordered if one[1].probability() >= 0.5]
         # From a search that failed the steps lead to where the ensemble itself says that a limit breaks, and some limits they cannot
         # keep: then nothing is taken back, where that is likelier to keep them.
-        return likely or sorted([*ordered, start], key=lambda one: -one[1].probability())
+        if not likely:
+            return sorted([*ordered, start], key=lambda one: -one[1].probability())
+        polished = self._polished(space, belief, *likely[0], CAUTION[0])
+        return [(polished, _predicted(belief, polished, seed)), *likely]
 
     def _covered(self, belief: Belief, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Envelope steps on the plant that is expected."""
