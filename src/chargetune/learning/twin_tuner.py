@@ -56,13 +56,13 @@ AIMED = 0.5
 class TwinTuner:
     """First theta_0; then the theta that is best on the plant as the traces so far show it.
 
-    Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). One candidate solves max objective s.t.
-    excess <= tolerance, in every window where the score has a profile, on the simulated closed loop with the twin at its posterior
-    mode plus the mean discrepancy (`Search`), searched from theta_0, ``pool`` Sobol points and the thetas tried so far. Envelope steps
-    from there, by several sd of an ensemble (`CAUTION`), give the others. Constrained log expected improvement, on m corrected by the
-    Gaussian process of what the trials left of it, picks one (`most_promising`). Further thetas of a batch, and those proposed beside
-    running trials, are best on posterior draws. Deterministic: the same trials give the same thetas. Without a single trace the
-    design is Sobol's.
+    Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). Candidates begin where max objective s.t.
+    excess <= tolerance, in every window where the score has a profile, is solved on the simulated closed loop with the twin at its
+    posterior mode plus the mean discrepancy (`Search`), from theta_0, ``pool`` Sobol points and the thetas tried so far. They are
+    envelope steps from there, by several sd of an ensemble (`CAUTION`), and the first of them polished. Constrained log expected
+    improvement, on m corrected by the Gaussian process of what the trials left of it, picks one (`most_promising`). Further thetas of
+    a batch, and those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same
+    thetas. Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
