@@ -17,13 +17,14 @@ LOCK_VENV := build/lock-venv
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
 
+# --no-compile: what is imported is compiled then, and the other nine tenths of the packages never.
 setup: $(READY) ## make .venv with the locked versions
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "chargetune needs Python 3.11 or newer: make PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(if $(TORCH_INDEX),$(PIP) install --quiet --no-deps --index-url $(TORCH_INDEX) "$$(grep '^torch==' requirements.lock)")
-	$(PIP) install --quiet --requirement requirements.lock
+	$(if $(TORCH_INDEX),$(PIP) install --quiet --no-compile --no-deps --index-url $(TORCH_INDEX) "$$(grep '^torch==' requirements.lock)")
+	$(PIP) install --quiet --no-compile --requirement requirements.lock
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 

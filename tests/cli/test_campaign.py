@@ -40,7 +40,7 @@ def test_table_resume_and_json(tmp_path):
     assert "of 2" in table
 
     path.write_text(path.read_text() + "trials = 5\n")
-    answer = json.loads(chargetune("campaign", path, "--store", store, "--json").stdout)
+    answer = json.loads(chargetune("campaign", path, "--store", store, "--workers", 1, "--json").stdout)
     assert [(s["study"], s["config"], s["seed"], s["state"], s["trials"]) for s in answer["studies"]] == [
         (f"{name} seed {seed}", f"{name}.toml", seed, "done", 5) for name in ("one", "two") for seed in (0, 1)
     ]
@@ -50,7 +50,7 @@ def test_table_resume_and_json(tmp_path):
     assert all(s["best"]["trial"] == best[s["study"]] for s in answer["studies"] if s["best"]["feasible"])
 
     (tmp_path / "one.toml").write_text(STUDY.replace("60", "50"))
-    stopped = chargetune("campaign", path, "--store", store, code=1).stdout
+    stopped = chargetune("campaign", path, "--store", store, "--workers", 1, code=1).stdout
     assert "one seed 0 stopped: StudyError: study 'one seed 0' was begun with something else" in " ".join(stopped.split())
 
 

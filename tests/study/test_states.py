@@ -218,4 +218,4 @@ class States(RuleBasedStateMachine):
 
 
 def test_any_sequence(location):
-    run_state_machine_as_test(lambda: States(location), settings=settings(max_examples=15, stateful_step_count=20, deadline=None))
+    run_state_machine_as_test(lambda: States(location), settings=settings(max_examples=10, stateful_step_count=20, deadline=None))
