@@ -17,7 +17,7 @@ LOCK_VENV := build/lock-venv
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
 
-# --no-compile: what is imported is compiled then, and the other nine tenths of the packages never.
+# --no-compile: what is imported is compiled then, and most modules of the packages never are.
 setup: $(READY) ## make .venv with the locked versions
 
 $(READY): requirements.lock pyproject.toml
