@@ -41,9 +41,9 @@ def study(tmp_path):
 
 
 def test_check_is_silent_on_an_example(chargetune_here, tmp_path):
-    code, out, _ = chargetune_here("check", EXAMPLES / "fast_charge.toml", "--json", "--figures", tmp_path / "f")
+    code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml", "--json", "--figures", tmp_path / "f")
     assert code == 0
-    assert json.loads(out) == {"file": str(EXAMPLES / "fast_charge.toml"), "findings": [], "figures": []}
+    assert json.loads(out) == {"file": str(EXAMPLES / "reference_model.toml"), "findings": [], "figures": []}
     assert "nothing found" in chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
 
 
