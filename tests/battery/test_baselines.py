@@ -18,6 +18,8 @@ from chargetune.episode.episode import Ending
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 VOLTAGE = Limit("voltage_max_V", 4.2, 5e-4)
 

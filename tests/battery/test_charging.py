@@ -14,6 +14,8 @@ from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRati
 from chargetune.episode.episode import Ending, Episode
 from chargetune.plants.sensors import Sensors
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 NAN, INF = math.nan, math.inf
 
@@ -88,14 +90,12 @@ def test_theta_is_backoff_first_then_the_ratios():
     np.testing.assert_allclose(p.space.from_unit(np.full(21, 0.5))[12:], 1.0, rtol=1e-12)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_the_untuned_theta_is_the_untuned_controller():
     plain = problem(mismatch_seed=3).episode()
     tuned = problem(mismatch_seed=3, backoff=Backoff(), ratios=(ResistanceRatio("R0"), ResistanceRatio("R1"))).episode()
     np.testing.assert_allclose(tuned.input, plain.input, rtol=0, atol=2e-4)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_the_right_ratios_undo_the_mismatch():
     p = problem(mismatch_seed=2, ratios=(ResistanceRatio("R0", 0.1, 10.0), ResistanceRatio("R1", 0.1, 10.0)))
     wrong = mismatched(CELL, 2)
@@ -104,7 +104,6 @@ def test_the_right_ratios_undo_the_mismatch():
     assert score_of(p, right).metrics["overshoot_mV"] < score_of(p).metrics["overshoot_mV"] / 4
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_a_backoff_of_50_mV_keeps_50_mV():
     p = problem(mismatch_seed=None, backoff=Backoff())
     score = score_of(p, np.full(7, 0.05))
@@ -112,7 +111,6 @@ def test_a_backoff_of_50_mV_keeps_50_mV():
     assert score.excess["voltage_max_V"] == pytest.approx(-0.05, abs=1e-5)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_backoff_at_the_predicted_soc_differs_from_the_measured_one():
     theta = np.linspace(0.1, -0.1, 7)
     measured, predicted = (problem(mismatch_seed=1, backoff=Backoff(at=at)).episode(theta).input for at in ("measured", "predicted"))
@@ -123,7 +121,6 @@ def test_backoff_at_the_predicted_soc_differs_from_the_measured_one():
     np.testing.assert_allclose(*same, rtol=0, atol=6e-4)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_lower_current_limit_and_own_limits_are_kept():
     p = problem(mismatch_seed=0, current_max_A=4.0, current_min_A=0.5, voltage_max_V=4.1)
     episode = p.episode()
@@ -187,7 +184,6 @@ def test_a_call_without_score_keeps_the_episode(by_hand):
         assert p(p.space.default, 0) == (None, episode, said)
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_noise_comes_from_the_seed_alone():
     p = problem(steps=30, sensors=Sensors(noise_sd={"voltage_V": 2e-3, "soc": 1e-3}))
     one, again, other = (p.episode(seed=s) for s in (1, 1, 2))
@@ -198,7 +194,6 @@ def test_noise_comes_from_the_seed_alone():
 TUNED = {"mismatch_seed": 3, "backoff": Backoff(), "ratios": (ResistanceRatio("R1"),), "steps": 60}
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_it_pickles_small_also_after_use():
     p = problem(**TUNED)
     p.episode()

@@ -7,6 +7,8 @@ from chargetune.battery.reproduce import open_study
 from chargetune.study.earlier import Earlier
 from chargetune.study.store import Store
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 QUICK = """
 [study]
 name = "NAME"

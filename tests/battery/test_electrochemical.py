@@ -17,6 +17,8 @@ from chargetune.episode.episode import Ending
 from chargetune.plants.plant import PlantError
 from chargetune.plants.sensors import Sensors
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 SPM = Electrochemical(model="SPM")
 NAMES = ("voltage_V", "soc", "temperature_K", "anode_potential_V")
 

@@ -20,6 +20,8 @@ from chargetune.battery.record import Record, checked
 from chargetune.battery.thermal import Anode, Thermal
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 # Tables so flat that splines between nodes do not matter; time constants that pulses of 60 s can tell.
 TRUE = replace(
     default_cell(),

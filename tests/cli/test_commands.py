@@ -159,6 +159,7 @@ def test_tune_resumes_shows_and_draws(tmp_path):
     assert "other" in chargetune("show", tmp_path / "whole.sqlite", "--study", "other", code=2).stderr
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_another_seed_or_a_changed_config_does_not_resume_silently(tmp_path):
     path, store = write(tmp_path, QUICK), tmp_path / "s.sqlite"
     chargetune("tune", path, "--trials", 2, "--store", store)

@@ -1,11 +1,10 @@
 """`chargetune tune` with a table [safety]."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import run
 
 from chargetune.battery.config import load_config
 from chargetune.battery.reproduce import make_tuner
@@ -32,8 +31,7 @@ upper = 4.0
 def tune(folder, safety, tuner="twin", *options):
     study = folder / "study.toml"
     study.write_text(STUDY.format(tuner=tuner, safety=safety))
-    command = [sys.executable, "-m", "chargetune", "tune", str(study), "--store", str(folder / "s.sqlite"), *options]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    return run("tune", study, "--store", folder / "s.sqlite", *options, cwd=folder)
 
 
 def test_a_safe_study_says_what_it_promised_and_spent(tmp_path):

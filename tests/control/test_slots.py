@@ -15,8 +15,8 @@ def loop(slot, t, compiled):
     return simulate(controller(slot), SimulatedPlant(plant_model(), {}), steps=STEPS, theta=[t], compiled=compiled).input
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("slot", SLOTS)
+# What a slot does is decided before the loop is compiled: one compilation shows that nothing is lost there.
+@pytest.mark.parametrize(("slot", "compiled"), [*((slot, False) for slot in SLOTS), ("l", True)])
 def test_theta_in_this_slot_changes_the_loop(slot, compiled):
     untuned, tuned = loop(slot, 1.0, compiled), loop(slot, 0.7, compiled)
     assert np.max(np.abs(tuned - untuned)) > 1e-3
@@ -43,4 +43,4 @@ def test_the_neutral_theta_is_the_controller_without_theta(slot):
 def test_step_by_step_is_the_same_loop(slot):
     episode = run_episode(controller(slot), SimulatedPlant(plant_model(), {}), steps=STEPS, theta=[0.7])
     assert episode.failures == 0
-    np.testing.assert_allclose(episode.input, loop(slot, 0.7, True), atol=1e-5)
+    np.testing.assert_allclose(episode.input, loop(slot, 0.7, False), atol=1e-5)

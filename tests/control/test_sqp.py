@@ -18,6 +18,8 @@ from chargetune.model.model import Model, Signal
 from chargetune.model.parameters import ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 
 @pytest.mark.parametrize("slot", ["l", "E"])
 @pytest.mark.parametrize("seed", range(4))

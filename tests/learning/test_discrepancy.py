@@ -79,6 +79,16 @@ def test_the_scale_grows_with_what_was_not_foretold():
     assert scales[0] < 2.0 < scales[1]
 
 
+def test_a_repeat_says_nothing_of_elsewhere():
+    """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
+    problem = charge(pairs=True)
+    before, _ = beliefs(problem, (4.0, 1.6))
+    scale, mistake = before.discrepancy.foretold([problem.episode(np.full(9, 1.6), 7)])
+    assert scale > 0.7
+    assert mistake < 1.0
+
+
+@pytest.mark.usefixtures("virtual_machine")
 def test_features_are_one_to_three():
     belief, episodes = beliefs(charge(steps=60), (4.0,))
     with pytest.raises(ValueError, match="allowed are 1 to 3"):

@@ -16,6 +16,8 @@ from chargetune.learning import Envelope
 from chargetune.learning.envelope import covering, predicted_rows
 from chargetune.plants.sensors import Sensors
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 
 

@@ -76,7 +76,7 @@ def test_nothing_is_risked_for_nothing():
     """The time to 60 % asks nothing of the backoff near full: there the charge stays as careful as it began."""
     start = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
     problem = charge(ratios=(), backoff=start, charge_time_to_soc=0.6)
-    trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 4)
+    trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 3)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
     assert np.all(theta[9:] > 0.2)
@@ -135,8 +135,8 @@ def test_a_safe_batch_is_of_different_thetas_that_all_passed():
     assert len(np.unique(batch, axis=0)) > 1
     belief, others_seed = believe(tuner.loop, trials), 12345
     for theta in batch:
-        # Other plants than those it was chosen by: three standard errors of a share of 200 below 0.95.
-        assert belief.predict(theta, 200, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 200) ** 0.5
+        # Other plants than those it was chosen by: three standard errors of a share of 100 below 0.95.
+        assert belief.predict(theta, 100, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
     running = SimpleNamespace(number=2, theta=tuple(batch[0]), status="running", score=None, episode=None)
     np.testing.assert_array_equal(tuner.ask(problem.space, [*trials, running])[0], batch[1])
 

@@ -13,6 +13,8 @@ from chargetune.report.reading import StudyView
 from chargetune.report.style import BLUE, GREEN, ORANGE, RED
 from chargetune.study.trial import Trial, TrialStatus
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 DONE, FAILED, RUNNING = TrialStatus.DONE, TrialStatus.FAILED, TrialStatus.RUNNING
 
 

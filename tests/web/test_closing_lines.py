@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_tests_without_a_browser_are_named(tmp_path):
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "1", "tests/web/test_browser_live.py", "-k", "going_away"]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-n", "0", "tests/web/test_browser_live.py", "-k", "going_away"]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, "PATH": str(tmp_path)}, capture_output=True, text=True, timeout=120, check=False
     )

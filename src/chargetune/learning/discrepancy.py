@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -94,20 +95,21 @@ class Discrepancy:
         the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
         The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episodes, at
         the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
-        Neighbouring stretches err together, so `TOGETHER` of them count as one.
+        Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
+        variance that d^2 still is: what was measured before comes out as it was, however wrong the process is elsewhere.
         """
         scales = np.geomspace(0.1, 10.0, 61)
         chance, mistake = -0.5 * np.log(scales) ** 2, 0.0
         stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
         for episode in episodes:
-            square, unmodelled, rest, known = self._off(episode)
-            variance = scales[:, None] ** 2 * unmodelled[known] + rest[known]
-            chance = chance - 0.5 * np.sum(np.log(variance) + square[known] / variance, axis=1) / TOGETHER
-            mistake = float(np.sqrt(np.mean((square / (rest + stated**2))[known]))) if known.any() else 0.0
+            off = self._off(episode)
+            square, known = off.square[off.known], off.known
+            variance = scales[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
+            chance = chance - 0.5 * np.sum(off.novel[known] * (np.log(variance) + square / variance), axis=1) / TOGETHER
+            mistake = float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))) if known.any() else 0.0
         return float(scales[np.argmax(chance)]), mistake
 
-    def _off(self, episode: Episode) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """By stretch and output: squared error of the prediction, its variance by the discrepancy and by all else, whether measured."""
+    def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin
         predicted = twin.predict(posterior.mode, episode.input)
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
@@ -117,9 +119,12 @@ class Discrepancy:
         left, counts = blocks(twin.measured(episode) - twin.measured(filled))
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        spread = self._table(np.stack([part.variance for part in self._parts]))
+        at = self._at(episode)
+        unmodelled = self._table(np.stack([part.variance for part in self._parts]))(at)
+        before = self._table(np.stack([np.diag(part.prior) for part in self._parts]))(at)
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
-        return left**2, spread(self._at(episode)), rest, (counts > 0) & np.isfinite(left)
+        novel = np.divide(unmodelled, before, out=np.zeros_like(before), where=before > 0)
+        return _Off(left**2, unmodelled, novel, rest, (counts > 0) & np.isfinite(left))
 
     def _table(self, values: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
         """Values at the nodes, shape (outputs, nodes) -> (features (K, n) -> values (K, outputs)), linear in between, held beyond."""
@@ -174,6 +179,21 @@ class Discrepancy:
             )
             for i, (name, noise) in enumerate(twin.noise_sd.items())
         )
+
+
+class _Off(NamedTuple):
+    """A prediction beside what was measured, by stretch and output, each of shape (stretches, outputs)."""
+
+    square: NDArray[np.float64]
+    """Squared error."""
+    unmodelled: NDArray[np.float64]
+    """Its variance by the discrepancy."""
+    novel: NDArray[np.float64]
+    """The share that this is of what it was before any trial."""
+    rest: NDArray[np.float64]
+    """Variance by unknowns and noise."""
+    known: NDArray[np.bool_]
+    """Whether it was measured."""
 
 
 @dataclass(frozen=True)
