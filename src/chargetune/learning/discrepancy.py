@@ -95,21 +95,19 @@ class Discrepancy:
         the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
         The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episodes, at
         the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
-        Neighbouring stretches err together, so `TOGETHER` of them count as one. What was measured before comes out as it was,
-        however wrong the process is elsewhere; where it does not, the process is wrong everywhere. So the scale is the larger one
-        of two: every stretch counts, or each by the share of its prior variance that d^2 still is.
+        Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
+        variance that d^2 still is: what was measured before comes out as it was, however wrong the process is elsewhere.
         """
         scales = np.geomspace(0.1, 10.0, 61)
-        chances, mistake = np.tile(-0.5 * np.log(scales) ** 2, (2, 1)), 0.0
+        chance, mistake = -0.5 * np.log(scales) ** 2, 0.0
         stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
         for episode in episodes:
             off = self._off(episode)
             square, known = off.square[off.known], off.known
             variance = scales[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
-            unlikely = np.log(variance) + square / variance
-            chances -= 0.5 * np.stack([np.sum(unlikely, axis=1), np.sum(off.novel[known] * unlikely, axis=1)]) / TOGETHER
+            chance = chance - 0.5 * np.sum(off.novel[known] * (np.log(variance) + square / variance), axis=1) / TOGETHER
             mistake = float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))) if known.any() else 0.0
-        return float(np.max(scales[np.argmax(chances, axis=1)])), mistake
+        return float(scales[np.argmax(chance)]), mistake
 
     def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin
