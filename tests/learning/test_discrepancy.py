@@ -9,24 +9,39 @@ from two_pairs import TwoPairs
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
+from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning.belief import believe
 from chargetune.learning.discrepancy import Discrepancy
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
+WARM = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1))
 
 
-def charge(seed=1, *, pairs=False, **changes):
+def charge(seed=1, *, pairs=False, cell=CELL, **changes):
     return ChargingProblem(
-        CELL, mismatch_seed=seed, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
-        plant_model=TwoPairs(CELL) if pairs else None, **changes,
+        cell, mismatch_seed=seed, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
+        plant_model=TwoPairs(cell) if pairs else None, **changes,
     )  # fmt: skip
+
+
+def told(episode):
+    return SimpleNamespace(episode=lambda: episode)
 
 
 def beliefs(problem, ratios):
     episodes = [problem.episode(np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
-    return believe(ChargingTwin(problem), [SimpleNamespace(episode=lambda e=e: e) for e in episodes]), episodes
+    return believe(ChargingTwin(problem), [told(e) for e in episodes]), episodes
+
+
+def gap(episode, name, where):
+    """The episode without the samples of one output at ``where``."""
+    column, changed = episode.output_names.index(name), {}
+    for side in ("output_start", "output_end"):
+        changed[side] = getattr(episode, side).copy()
+        changed[side][where, column] = np.nan
+    return replace(episode, **changed)
 
 
 def drawn_voltages(belief, episode, count=48):
@@ -68,6 +83,36 @@ def test_a_sample_is_surer_where_something_was_measured():
     near = drawn_voltages(belief, episodes[0]).std(axis=0).mean()
     far = drawn_voltages(belief, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
     assert far > 3 * near
+
+
+def test_between_the_nodes_of_a_coarse_table_a_sample_is_as_sure():
+    """With three features the nodes are far from what was measured, and every sampled plant has to pass through it all the same."""
+    belief, episodes = beliefs(charge(pairs=True, cell=WARM), (4.0,))
+    near = drawn_voltages(belief, episodes[0]).std(axis=0).mean()
+    far = drawn_voltages(belief, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    assert len(belief.loop.features) == 3
+    assert far > 20 * near
+
+
+@pytest.mark.parametrize(("name", "seen"), [("temperature_K", True), ("temperature_K", False), ("soc", True)])
+def test_a_gap_in_a_feature_is_bridged(name, seen):
+    """A sensor that fails for a third of a trial, or for all of it where the twin predicts what it measures."""
+    problem = charge(cell=WARM)
+    episode = problem.episode(np.full(9, 4.0), 0)
+    holed = gap(episode, name, slice(100, 200) if seen else slice(None))
+    whole, bridged = (
+        Discrepancy(believe(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
+    )
+    off = np.abs(bridged._signals(holed) - whole._signals(episode)) / [1.0, 6.0, 35.0]
+    assert np.max(off) < 0.05
+    assert np.all(np.isfinite(bridged.error(bridged.posterior.mode)(holed).signal("voltage_V")[1]))
+
+
+def test_a_feature_that_was_never_measured_is_named():
+    problem = charge(cell=WARM)
+    holed = gap(problem.episode(np.full(9, 4.0), 0), "soc", slice(None))
+    with pytest.raises(ValueError, match="soc was never measured in an episode of"):
+        believe(ChargingTwin(problem), [told(holed)] * 2)
 
 
 def test_the_scale_grows_with_what_was_not_foretold():

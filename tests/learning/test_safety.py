@@ -79,7 +79,8 @@ def test_nothing_is_risked_for_nothing():
     trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 3)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
-    assert np.all(theta[9:] > 0.2)
+    # Not all the way at 0.9: the curve through the nodes would bend down before it, where it is needed.
+    assert np.all(theta[9:] > (0.1, 0.2))
     assert np.all(theta[2:6] < 0.2)
     assert trials[-1].score.objective > trials[1].score.objective
 

@@ -17,7 +17,6 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.ndimage import map_coordinates
 
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
@@ -70,14 +69,16 @@ class Discrepancy:
             if stream is not None:
                 table = table + part.root @ stream.standard_normal(len(table))
             tables.append(table)
-        at_nodes = self._table(np.stack(tables))
+        values = np.stack(tables)
 
         def add(episode: Episode) -> Episode:
             columns = [episode.output_names.index(name) for name in names]
             changed = []
+            at = self._signals(episode)
             for k, outputs in enumerate((episode.output_start, episode.output_end)):
                 out = outputs.copy()
-                out[:, columns] += at_nodes(np.stack([_feature(episode, name)[k] for name in self.features], axis=1))
+                nodes, shares = self._lattice(at[:, k])
+                out[:, columns] += np.sum(values[:, nodes] * shares, axis=-1).T
                 changed.append(out)
             return replace(episode, output_start=changed[0], output_end=changed[1])
 
@@ -119,22 +120,54 @@ class Discrepancy:
         left, counts = blocks(twin.measured(episode) - twin.measured(filled))
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        at = self._at(episode)
-        unmodelled = self._table(np.stack([part.variance for part in self._parts]))(at)
-        before = self._table(np.stack([np.diag(part.prior) for part in self._parts]))(at)
+        weights = self._weights(self._at(episode))
+        unmodelled = np.stack([part.variance(weights) for part in self._parts], axis=1)
+        before = np.stack([part.variance_before(weights) for part in self._parts], axis=1)
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
         novel = np.divide(unmodelled, before, out=np.zeros_like(before), where=before > 0)
         return _Off(left**2, unmodelled, novel, rest, (counts > 0) & np.isfinite(left))
 
-    def _table(self, values: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-        """Values at the nodes, shape (outputs, nodes) -> (features (K, n) -> values (K, outputs)), linear in between, held beyond."""
-        last = np.array(self._nodes)[:, None] - 1.0
-        lattices = values.reshape(-1, *self._nodes)
-        return lambda at: np.stack([map_coordinates(v, self._unit(at).T * last, order=1, mode="nearest") for v in lattices], axis=1)
+    def _lattice(self, at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """The nodes around each of K features (K, n), and their shares of a value there, both of shape (K, 2^n): linear, held beyond."""
+        unit = np.clip(self._unit(at), 0.0, 1.0)
+        nodes, shares = np.zeros((len(at), 1), dtype=np.intp), np.ones((len(at), 1))
+        for place, count in zip(unit.T * (np.array(self._nodes)[:, None] - 1.0), self._nodes, strict=True):
+            below = np.minimum(place.astype(np.intp), count - 2)[:, None]
+            beyond = place[:, None] - below
+            nodes = np.hstack([nodes * count + below, nodes * count + below + 1])
+            shares = np.hstack([shares * (1.0 - beyond), shares * beyond])
+        return nodes, shares
+
+    def _weights(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`_lattice` as a matrix: values at the nodes -> values at K features, shape (K, nodes)."""
+        nodes, shares = self._lattice(at)
+        out = np.zeros((len(at), int(np.prod(self._nodes))))
+        np.put_along_axis(out, nodes, shares, axis=1)
+        return out
 
     def _at(self, episode: Episode) -> NDArray[np.float64]:
         """Mean features of every stretch, shape (stretches, features)."""
-        return blocks(np.stack([np.stack(_feature(episode, name), axis=1) for name in self.features], axis=2))[0]
+        return blocks(self._signals(episode))[0]
+
+    def _signals(self, episode: Episode) -> NDArray[np.float64]:
+        """Features at both ends of every interval, shape (intervals, 2, features).
+
+        Where one was not measured it is what the twin predicts, and where the twin does not, what lies between its neighbours.
+        """
+        out = np.stack([np.stack(_feature(episode, name), axis=1) for name in self.features], axis=2)
+        if np.all(np.isfinite(out)):
+            return out
+        twin = self.posterior.twin
+        predicted = dict(zip(twin.noise_sd, np.moveaxis(twin.predict(self.posterior.mode, episode.input), -1, 0), strict=True))
+        for i, name in enumerate(self.features):
+            seen = np.isfinite(out[..., i])
+            if not seen.any() and name not in predicted:
+                raise ValueError(f"discrepancy: {name} was never measured in an episode of {len(episode)} intervals")
+            time = np.arange(seen.size).reshape(seen.shape)
+            out[..., i] = np.where(
+                seen, out[..., i], predicted[name] if name in predicted else np.interp(time, time[seen], out[..., i][seen])
+            )
+        return out
 
     @property
     def _nodes(self) -> tuple[int, ...]:
@@ -143,11 +176,6 @@ class Discrepancy:
     def _unit(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         low, high = np.array(list(self.features.values())).T
         return np.asarray((values - low) / (high - low))
-
-    @cached_property
-    def _places(self) -> NDArray[np.float64]:
-        """Features of every stretch, scaled to 0..1, shape (n, number of features)."""
-        return self._unit(np.concatenate([self._at(episode) for episode in self.episodes]))
 
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean residual of every stretch, shape (n, outputs); 0 where nothing was measured."""
@@ -164,18 +192,19 @@ class Discrepancy:
             -1, len(self.features)
         )
         inputs = [i for i, name in enumerate(self.features) if name in twin.model.input_names]
-        both = np.vstack([self._places, lattice])
         low, high = np.array(list(self.features.values())).T
-        sizes = np.abs(low + both * (high - low)) / np.maximum(np.abs(low), np.abs(high))
-        weight = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(both))
+        sizes = np.abs(low + lattice * (high - low)) / np.maximum(np.abs(low), np.abs(high))
+        size = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(lattice))
+        at = np.concatenate([self._at(episode) for episode in self.episodes])
+        weights = self._weights(at)
         return tuple(
             _part(
-                self._places,
+                self._unit(at),
                 left[:, i],
                 noise**2 / np.maximum(counts[:, i], 1e-9),
                 lattice,
-                self.scale * twin.error_sd.get(name, 0.0),
-                weight,
+                weights,
+                self.scale * twin.error_sd.get(name, 0.0) * size,
             )
             for i, (name, noise) in enumerate(twin.noise_sd.items())
         )
@@ -204,10 +233,13 @@ class _Part:
     prior: NDArray[np.float64]
     cross: NDArray[np.float64]
 
-    @property
-    def variance(self) -> NDArray[np.float64]:
-        """At the nodes, shape (nodes,)."""
-        return np.asarray(np.maximum(np.diag(self.prior) - np.sum(self.gain * self.cross.T, axis=1), 0.0))
+    def variance(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """With ``weights`` of the nodes (K, nodes), shape (K,)."""
+        return np.asarray(np.sum((weights @ self.root) ** 2, axis=1))
+
+    def variance_before(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same before anything was measured."""
+        return np.asarray(np.sum((weights @ self.prior) * weights, axis=1))
 
     @cached_property
     def root(self) -> NDArray[np.float64]:
@@ -222,8 +254,8 @@ def _part(
     left: NDArray[np.float64],
     variance: NDArray[np.float64],
     lattice: NDArray[np.float64],
-    least: float,
-    weight: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    least: NDArray[np.float64],
 ) -> _Part:
     size = float(np.sqrt(np.mean(left**2))) or 1.0
     d = x.shape[1]
@@ -239,14 +271,12 @@ def _part(
     )  # fmt: skip
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     with torch.no_grad():
-        both = torch.as_tensor(np.vstack([x, lattice]) / medians)
-        whole = kernel(both).to_dense().numpy()
+        prior = kernel(torch.as_tensor(lattice / medians)).to_dense().numpy()
         # One trajectory that the model fits says little of others.
-        whole *= size**2 * float(scaled.outputscale) + least**2 * np.outer(weight, weight)
-    n = len(x)
-    seen = cho_factor(whole[:n, :n] + np.diag(variance + JITTER * whole[0, 0]), lower=True)
-    gain = cho_solve(seen, whole[:n, n:]).T
-    return _Part(gain, whole[n:, n:], whole[:n, n:])
+        prior *= size**2 * float(scaled.outputscale) + np.outer(least, least)
+    cross = weights @ prior
+    seen = cho_factor(cross @ weights.T + np.diag(variance + JITTER * prior[0, 0]), lower=True)
+    return _Part(cho_solve(seen, cross).T, prior, cross)
 
 
 def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
