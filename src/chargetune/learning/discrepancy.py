@@ -45,6 +45,8 @@ class Discrepancy:
     where it is measured, the temperature. The data are residuals, averaged over `BLOCKS` stretches of each episode, because
     neighbouring residuals have the same cause. For a draw of the twin's unknowns the process is conditioned on that draw's own
     residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
+    k is known at the nodes of a table and linear in between, k(s, s') = w(s)' K w(s') with the shares w of the nodes around s, so
+    that a sample drawn at the nodes is one of this process (Wilson and Nickisch, ICML 2015).
     Hyperparameters: maximum a posteriori of the residuals at the mode (BoTorch), log-normal priors.
     Source: Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425.
     """
@@ -235,7 +237,8 @@ class _Part:
 
     def variance(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """With ``weights`` of the nodes (K, nodes), shape (K,)."""
-        return np.asarray(np.sum((weights @ self.root) ** 2, axis=1))
+        taken = np.sum((weights @ self.gain) * (weights @ self.cross.T), axis=1)
+        return np.asarray(np.maximum(self.variance_before(weights) - taken, 0.0))
 
     def variance_before(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same before anything was measured."""
