@@ -1,8 +1,8 @@
 """From a cell on the bench to the cell file of a controller: here the bench is PyBaMM's DFN.
 
-Run: python examples/electrochemical_cell.py FOLDER. A pulse test at 298 K gives the circuit, pulse tests at two more
-temperatures how its resistance falls when it warms, and one charge its heat capacity and cooling: `okane2022.toml`. A slow
-charge more, with a reference electrode, gives the anode potential too: `okane2022_anode.toml`.
+Run: python examples/electrochemical_cell.py FOLDER. A slow cycle gives the open-circuit voltage, a pulse test at 298 K the
+circuit, pulse tests at two more temperatures how its resistance falls when it warms, and one charge its heat capacity and
+cooling: `okane2022.toml`. A slow charge more, with a reference electrode, gives the anode potential too: `okane2022_anode.toml`.
 """
 
 import sys
@@ -17,7 +17,7 @@ from chargetune.battery.identify import cell_toml, identify
 from chargetune.battery.identify_anode import with_anode
 from chargetune.battery.identify_thermal import activation_energy, with_thermal
 from chargetune.battery.limits import Limit
-from chargetune.battery.pulse_test import pulse_test
+from chargetune.battery.pulse_test import pulse_test, slow_cycle
 from chargetune.battery.record import Record
 from chargetune.plants.sensors import Sensors
 
@@ -28,10 +28,11 @@ def bench(ambient_K, seconds, soc=1.0):
 
 
 capacity = Electrochemical().capacity_Ah
+ocv = slow_cycle(bench(298.15, 60.0), capacity_Ah=capacity, voltage_min_V=2.5, voltage_max_V=4.2)
 cells = {}
 for ambient in (283.15, 298.15, 313.15):
     record = pulse_test(lambda seconds, ambient=ambient: bench(ambient, seconds), capacity_Ah=capacity, voltage_min_V=2.5)
-    cells[ambient] = identify(record, capacity_Ah=capacity).cell
+    cells[ambient] = identify(record, capacity_Ah=capacity, ocv=ocv).cell
     print(f"{ambient:.0f} K: {cells[ambient].remark}")
 
 limit = Limit("voltage_max_V", 4.2, 0.0)
@@ -51,7 +52,8 @@ cell = replace(
     current_max_A=15.0,
     voltage_min_V=2.5,
     voltage_max_V=4.2,
-    remark="R-RC circuit identified from simulated pulses on PyBaMM's DFN with the parameters of O'Kane et al., PCCP 24 (2022) 7909.",
+    remark="R-RC circuit identified from simulated pulses and a slow cycle on PyBaMM's DFN "
+    "with the parameters of O'Kane et al., PCCP 24 (2022) 7909.",
 )
 print(f"E = {energy:.0f} J/mol, C = {cell.thermal.heat_capacity_J_K:.1f} J/K, hA = {cell.thermal.cooling_W_K:.4f} W/K")
 slow = charge(bench(298.15, 60.0, 0.02), constant_current(1.0), [limit], steps=300, soc_target=1.0, current_max_A=1.0)

@@ -14,7 +14,7 @@ from chargetune.battery.cyclers import read_record
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.identify import cell_toml, identify, predicted_voltage
 from chargetune.battery.identify_thermal import activation_energy, with_thermal
-from chargetune.battery.pulse_test import pulse_test, record_csv
+from chargetune.battery.pulse_test import pulse_test, record_csv, slow_cycle
 from chargetune.battery.pulses import find_pulse_sets, groups, segments
 from chargetune.battery.record import Record, checked
 from chargetune.battery.thermal import Anode, Thermal
@@ -47,6 +47,20 @@ def test_a_known_circuit_comes_back(cell, rc):
         for name in cell.tables:
             assert fit.values[name] == pytest.approx(getattr(cell, name)[0], rel=0.25 if name[1] == "2" else 0.12), name
     assert found.cell.capacity_Ah == 2.0
+
+
+def test_a_slow_cycle_tells_the_ocv_from_empty_to_full():
+    """Against the table of the circuit it ran on; it ends as full as it began, because the current falls at the limit."""
+    cell = default_cell()
+    plant = triable(SimulatedPlant(ecm_model(cell, 60.0), start_state(cell, 1.0)))
+    slow = slow_cycle(plant, capacity_Ah=cell.capacity_Ah, voltage_min_V=cell.ocv_V[0], voltage_max_V=4.2)
+    assert slow.charge_Ah[-1] == pytest.approx(0.0, abs=2e-3 * cell.capacity_Ah)
+    found = identify(measured(cell), ocv=slow, capacity_Ah=cell.capacity_Ah).cell
+    soc = np.linspace(0.1, 1.0, 200)
+    true, rests = PchipInterpolator(cell.ocv_soc, cell.ocv_V)(soc), identify(measured(cell), capacity_Ah=cell.capacity_Ah).cell
+    off, without = (np.max(np.abs(PchipInterpolator(c.ocv_soc, c.ocv_V)(soc) - true)) for c in (found, rests))
+    assert off < 2e-3
+    assert without > 5e-3
 
 
 def test_the_stated_standard_deviation_is_that_of_repetitions():

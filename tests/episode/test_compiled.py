@@ -268,11 +268,29 @@ def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
         same(episode, replace(episodes, plant=one).run(theta, 3))
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="an ensemble shares the cores where its loop is compiled")
+@pytest.mark.parametrize("name", ["ideal", "noise", "Kalman filter, delay 1"])
+def test_errors_of_what_is_measured_are_read_by_the_estimator(charging, same, name):
+    """A constant error is the bias of a sensor."""
+    controller, plant = loop(charging, name)
+    off = {"voltage_V": 4e-3, "soc": 0.01}
+    biased = replace(plant, sensors=replace(plant.sensors, bias={k: plant.sensors.bias.get(k, 0.0) + v for k, v in off.items()}))
+    errors = np.tile([off.get(s.name, 0.0) for s in plant.outputs], (40, 2, 1))
+    episode = compiled_episode(controller, plant, 40).run_each([THETA], [plant], 3, [errors])[0]
+    whole = compiled_episode(controller, biased, 40).run(THETA, 3)
+    assert np.max(np.abs(episode.input - compiled_episode(controller, plant, 40).run(THETA, 3).input)) > 1e-3
+    # Rounding of the error that is added in another order.
+    for mine, other in ((episode.input, whole.input), (episode.output_start, whole.output_start), (episode.output_end, whole.output_end)):
+        np.testing.assert_allclose(mine, other, rtol=0, atol=1e-9)
+
+
 def test_an_ensemble_refuses_what_does_not_belong_to_it(charging):
     controller, plant = loop(charging, "ideal")
     episodes = compiled_episode(controller, plant, 10)
-    with pytest.raises(ValueError, match="2 thetas and 1 plants"):
+    with pytest.raises(ValueError, match="2 thetas, 1 plants and 1 errors"):
         episodes.run_each([THETA, THETA], [plant])
     other = replace(plant, model=replace(plant.model, f=ca.Function("f", list(plant.model.f.sx_in()), [plant.model.f.sx_in()[0]])))
     with pytest.raises(ValueError, match=r"plants\[1\] has another model"):
         episodes.run_each([THETA, THETA], [plant, other])
+    with pytest.raises(ValueError, match=r"errors have the shape \(9, 2, 3\), allowed is \(10, 2, 3\)"):
+        episodes.run_each([THETA], [plant], errors=[np.zeros((9, 2, 3))])

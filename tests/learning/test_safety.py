@@ -1,15 +1,14 @@
 """Safe learning: what reaches the plant, what it promises, and when it stops."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from two_pairs import TwoPairs
+from two_pairs import AnotherCell, TwoPairs
 
-from chargetune.battery.cell import Cell, default_cell
+from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import Backoff, ChargingProblem, ResistanceRatio
-from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import LimitBackoff
 from chargetune.battery.twin import ChargingTwin
@@ -17,7 +16,6 @@ from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
 from chargetune.learning.belief import believe
 from chargetune.plants.sensors import Sensors
-from chargetune.plants.simulated import SimulatedPlant
 
 CELL = default_cell()
 
@@ -26,16 +24,6 @@ def charge(seed=1, noise=0.002, **changes):
     sensors = Sensors(noise_sd={"voltage_V": noise}) if noise else Sensors()
     parts = {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)} | changes
     return ChargingProblem(CELL, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **parts)
-
-
-@dataclass(frozen=True)
-class AnotherCell:
-    """The circuit of this cell as plant, whatever the learner knows."""
-
-    cell: Cell
-
-    def plant(self, soc_start, sampling_time_s, sensors):
-        return SimulatedPlant(ecm_model(self.cell, sampling_time_s), start_state(self.cell, soc_start), sensors)
 
 
 def told(number, theta, score, episode):

@@ -5,10 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from two_pairs import AnotherCell
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.electrochemical import Electrochemical
+from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
 from chargetune.learning.belief import believe
@@ -111,6 +114,60 @@ def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
     off = np.abs(posterior.mode - true)[-3:] / np.sqrt(np.diag(posterior.covariance))[-3:]
     assert np.all(off < 3)
     assert np.all(np.sqrt(np.diag(posterior.covariance))[-3:] < [0.02, 0.01, 0.005])
+
+
+@pytest.mark.usefixtures("virtual_machine")
+def test_diffusion_comes_back_where_a_cell_has_it():
+    """The surface of the particles runs ahead of their mean: gain and time constant of another circuit's charge."""
+    loop = ChargingTwin(charge(seed=2), diffusion=True)
+    names = list(loop.twin.model.parameter_blocks)[-2:]
+    assert [one.name for one in loop.twin.unknowns[-2:]] == names == ["diffusion_gain_s", "diffusion_time_constant_s"]
+    true = np.append(np.zeros(27), [0.5, 0.4])
+    episodes = loop.simulate([(theta, true, None) for theta in (loop.problem.space.default, loop.problem.space.upper)])
+    posterior = loop.twin.fit(episodes)
+    sd = np.sqrt(np.diag(posterior.covariance))[-2:]
+    assert np.all(sd < [0.5, 0.5])
+    assert np.all(np.abs(posterior.mode - true)[-2:] < 2 * sd)
+    without = ChargingTwin(charge(seed=2)).twin.fit(episodes)
+
+    def misfit(fitted):
+        return max(np.max(np.abs(fitted.twin.predict(fitted.mode, e.input) - fitted.twin.measured(e))[..., 0]) for e in episodes)
+
+    assert misfit(posterior) < 1e-3
+    assert misfit(without) > 3 * misfit(posterior)
+
+
+def test_diffusion_is_left_out_of_a_circuit_and_not_of_an_electrochemical_cell():
+    electrochemical = replace(charge(), plant_model=Electrochemical())
+    for problem, diffusion, there in (
+        (charge(), None, False),
+        (charge(), True, True),
+        (electrochemical, None, True),
+        (electrochemical, False, False),
+    ):
+        assert ("soc_lead" in ChargingTwin(problem, diffusion=diffusion).twin.model.state_names) is there
+
+
+def test_the_controller_reads_what_the_twin_cannot_represent():
+    """A cell that is half a kelvin warmer than its model, held at a limit of temperature, against a sensor that is off by as much."""
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.05, activation_J_mol=15e3))
+    problem = ChargingProblem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, ratios=(ResistanceRatio("R0"),))
+    loop = ChargingTwin(problem)
+
+    def warmer(episode):
+        shift = np.array([0.5 if name == "temperature_K" else 0.0 for name in episode.output_names])
+        return replace(episode, output_start=episode.output_start + shift, output_end=episode.output_end + shift)
+
+    theta = problem.space.default
+    predicted = loop.simulate([(theta, np.zeros(27), warmer)])[0]
+    # The circuit of the twin is the controller's own: the plant without a mismatch.
+    biased = replace(problem, plant_model=AnotherCell(problem.controller_cell), sensors=Sensors(bias={"temperature_K": 0.5}))
+    measured = biased.episode(theta)
+    for name in ("temperature_K", "voltage_V"):
+        np.testing.assert_allclose(predicted.signal(name)[1], measured.signal(name)[1], rtol=0, atol=1e-6)
+    assert np.max(measured.signal("temperature_K")[1]) == pytest.approx(305.0, abs=0.1)
+    without = loop.simulate([(theta, np.zeros(27), None)])[0]
+    assert np.max(np.abs(without.input - predicted.input)) > 0.1
 
 
 def test_what_the_model_cannot_represent_is_a_discrepancy():

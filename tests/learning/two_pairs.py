@@ -18,3 +18,13 @@ class TwoPairs:
         ocv = tuple(v + 0.004 for v in self.cell.ocv_V)
         cell = replace(self.cell, R2_ohm=(0.012,) * count, C2_F=(25e3,) * count, ocv_V=ocv)
         return SimulatedPlant(ecm_model(cell, sampling_time_s), start_state(cell, soc_start), sensors)
+
+
+@dataclass(frozen=True)
+class AnotherCell:
+    """The circuit of this cell as plant, whatever the learner knows."""
+
+    cell: Cell
+
+    def plant(self, soc_start, sampling_time_s, sensors):
+        return SimulatedPlant(ecm_model(self.cell, sampling_time_s), start_state(self.cell, soc_start), sensors)

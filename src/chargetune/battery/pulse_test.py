@@ -1,4 +1,4 @@
-"""A pulse test (HPPC) on a simulated cell: the measurement that `identify` reads, where there is no cycler."""
+"""A pulse test (HPPC) and a slow cycle on a simulated cell: the measurements that `identify` reads, where there is no cycler."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from chargetune.battery.baselines import Stepped
 from chargetune.battery.record import Record
 from chargetune.plants.plant import PlantError
 
-__all__ = ["pulse_test", "record_csv"]
+__all__ = ["pulse_test", "record_csv", "slow_cycle"]
 
 # A rest after each move, s: the slowest diffusion in a cell of some ampere-hours is over.
 REST_S = 3600.0
@@ -65,6 +65,36 @@ def pulse_test(
     table: Any = np.array(rows)
     temperature = None if warm is None else table[:, 3]
     return Record("simulated pulse test", table[:, 0], table[:, 1], table[:, 2], temperature)
+
+
+def slow_cycle(
+    plant: Stepped, *, capacity_Ah: float, voltage_min_V: float, voltage_max_V: float, rate: float = 0.04, last: float = 0.1
+) -> Record:
+    """One discharge of a full cell at ``rate`` (1/h) to ``voltage_min_V`` and the charge back to ``voltage_max_V``.
+
+    At each limit the current is halved, and again, until it is below the share ``last`` of what it was: the cell is then as empty,
+    or as full, as at rest. The OCV lies between both at equal charge (`identify` with ``ocv``). The plant's sampling time is that
+    of the record.
+    """
+    voltage, state, now = [s.name for s in plant.outputs].index("voltage_V"), plant.start, 0.0
+    rows: list[tuple[float, float, float]] = []
+    for sign in (-1.0, 1.0):
+        current = sign * rate * capacity_Ah
+        for _ in range(round(2 * 3600 / rate / plant.sampling_time_s)):
+            try:
+                _, end, following = plant.ahead(state, current)
+                within = voltage_min_V <= float(end[voltage]) <= voltage_max_V
+            except PlantError:
+                within = False
+            if within:
+                state, now = following, now + plant.sampling_time_s
+                rows.append((now, current, float(end[voltage])))
+            elif abs(current) > last * rate * capacity_Ah:
+                current /= 2
+            else:
+                break
+    table: Any = np.array(rows)
+    return Record("simulated slow cycle", table[:, 0], table[:, 1], table[:, 2], None)
 
 
 def record_csv(record: Record) -> str:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.charging_check import stand_in
-from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.ecm import Diffusion, ecm_model, start_state
+from chargetune.battery.electrochemical import Electrochemical
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
+from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
@@ -31,6 +33,9 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
+# Of spheres with R^2 / D = 2300 and 6100 s, such as 5 um and 1e-14 m^2/s; diffusivities differ by orders of magnitude, and so does
+# the standard deviation of the logarithm. Fitted to the DFN: 230 to 330 s and 380 to 680 s.
+DIFFUSION, DIFFUSION_SPREAD = Diffusion(150.0, 300.0), {"diffusion_gain_s": 1.0, "diffusion_time_constant_s": 0.7}
 # Plants that are remembered: those of two ensembles.
 PLANTS_KEPT = 128
 # Windows of the SOC in which a predicted excess is told to the search.
@@ -44,6 +49,8 @@ class ChargingTwin:
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
     nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
     ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
+    With ``diffusion`` the circuit has that too (`Diffusion`), with gain and time constant unknown; by default where the plant is
+    electrochemical. The controller's own model stays as it is.
     """
 
     problem: ChargingProblem
@@ -52,6 +59,7 @@ class ChargingTwin:
     capacity_spread: float = 0.0
     soc_spread: float = 0.0
     ocv_spread_V: float = 0.0
+    diffusion: bool | None = None
 
     @cached_property
     def twin(self) -> Twin:
@@ -60,11 +68,12 @@ class ChargingTwin:
 
         problem = self.problem
         belief = problem.controller_cell
-        model = ecm_model(problem.plant_cell, problem.sampling_time_s).with_parameters(**{n: getattr(belief, n) for n in belief.tables})
+        model = self._circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
         anode = belief.anode is not None and problem.anode_min_V is not None
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
+        unknowns += [Uncertain(name, sd) for name, sd in DIFFUSION_SPREAD.items() if name in model.parameter_blocks]
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
@@ -72,6 +81,12 @@ class ChargingTwin:
         # Of the cell's own circuit the OCV is known. Of another plant it was identified, worst near full.
         at_rest = OCV_SHARE if problem.plant_model else 0.0
         return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
+
+    @cached_property
+    def _circuit(self) -> Model:
+        electrochemical = isinstance(self.problem.plant_model, Electrochemical)
+        diffusion = DIFFUSION if (electrochemical if self.diffusion is None else self.diffusion) else None
+        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s, diffusion=diffusion)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
@@ -95,13 +110,30 @@ class ChargingTwin:
         return self.problem.row_tolerances
 
     def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
-        """Charges without noise, with the third of each case added to what is measured."""
-        episodes = self._loop.run_each([theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases])
+        """Charges without noise, with the third of each case added to what is measured.
+
+        Where the estimator reads such an output the charge is simulated twice: the second time it reads the errors of the first.
+        """
+        thetas, plants = [theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases]
+        out = self._measured(self._loop.run_each(thetas, plants), cases)
+        added = [None if episode is None else _added(episode) for episode in out]
+        if not self._read or not any(one is not None and one.any() for one in added):
+            return out
+        return self._measured(self._loop.run_each(thetas, plants, errors=added), cases)
+
+    def _measured(self, episodes: Sequence[Episode], cases: Sequence[Case]) -> list[Episode | None]:
+        """What is measured in these episodes, whatever their estimators read; None where one failed."""
         out: list[Episode | None] = []
         for episode, (_, unknowns, error) in zip(episodes, cases, strict=True):
-            biased = _shifted(episode, self.twin.biases(unknowns))
+            biased = _shifted(episode.noise_free(), self.twin.biases(unknowns))
             out.append(None if episode.ending is not Ending.DONE else error(biased) if error else biased)
         return out
+
+    @cached_property
+    def _read(self) -> bool:
+        """Whether the controller's estimator reads an output that the twin has errors of."""
+        controller = self.problem.controller
+        return not set(controller.estimator.signals(controller.model)).isdisjoint(self.twin.noise_sd)
 
     def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
         # An ensemble goes through many thetas: its plants are made once.
@@ -149,7 +181,7 @@ class ChargingTwin:
         plant = problem.plant
         if not isinstance(plant, SimulatedPlant):
             raise TypeError("the twin's plant is a simulated circuit")
-        return compiled_episode(self.problem.controller, plant, problem.steps)
+        return compiled_episode(self.problem.controller, replace(plant, model=self._circuit), problem.steps)
 
 
 def _shifted(episode: Episode, biases: Mapping[str, float]) -> Episode:
@@ -158,3 +190,9 @@ def _shifted(episode: Episode, biases: Mapping[str, float]) -> Episode:
         return episode
     shift = np.array([biases.get(name, 0.0) for name in episode.output_names])
     return replace(episode, output_start=episode.output_start + shift, output_end=episode.output_end + shift)
+
+
+def _added(episode: Episode) -> NDArray[np.float64]:
+    """What its measured outputs are off by, shape (steps, 2, outputs)."""
+    exact = episode.noise_free()
+    return np.stack([episode.output_start - exact.output_start, episode.output_end - exact.output_end], axis=1)

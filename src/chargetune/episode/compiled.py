@@ -51,27 +51,35 @@ class CompiledEpisode:
         given, unknown = self._arguments(theta, self.plant, seed, trips)
         return self._episode(_evaluated(self.function, (self.steps, sum(self.widths)), given, unknown), self.plant, seed, trips)
 
-    def run_each(self, thetas: Sequence[ArrayLike | None], plants: Sequence[SimulatedPlant], seed: int = 0) -> list[Episode]:
+    def run_each(
+        self,
+        thetas: Sequence[ArrayLike | None],
+        plants: Sequence[SimulatedPlant],
+        seed: int = 0,
+        errors: Sequence[NDArray[np.float64] | None] | None = None,
+    ) -> list[Episode]:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
         The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
-        Raises ValueError when there are not as many of both, or one does not fit.
+        ``errors`` are added to what is measured, and so read by the estimator, each of shape (steps, 2, outputs): at both ends of
+        every interval. Raises ValueError when there are not as many of all, or one does not fit.
         """
-        if len(thetas) != len(plants):
-            raise ValueError(f"{len(thetas)} thetas and {len(plants)} plants, allowed are as many of both")
+        errors = [None] * len(plants) if errors is None else errors
+        if not len(thetas) == len(plants) == len(errors):
+            raise ValueError(f"{len(thetas)} thetas, {len(plants)} plants and {len(errors)} errors, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
         # An ensemble has few thetas: what depends on theta alone is computed once for each.
         of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
         given, unknown = [], []
-        for theta, plant in zip(thetas, plants, strict=True):
+        for theta, plant, added in zip(thetas, plants, errors, strict=True):
             check_run(plant, self.steps, seed, ())
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
                 of_theta[key] = self._of_theta(values)
-            known, unforeseen = self._with_plant(of_theta[key], plant, seed)
+            known, unforeseen = self._with_plant(of_theta[key], plant, seed, added)
             given.append(known)
             unknown.append(unforeseen)
         evaluated = partial(_evaluated, self.function, (self.steps, sum(self.widths)))
@@ -93,9 +101,15 @@ class CompiledEpisode:
         return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
 
     def _with_plant(
-        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int
+        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int, added: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         errors, process = disturbances(plant, self.steps, seed)
+        if added is not None:
+            expected = (self.steps, 2, len(plant.outputs))
+            if added.shape != expected:
+                raise ValueError(f"errors have the shape {added.shape}, allowed is {expected}: steps, both ends, outputs")
+            # At rest before the first interval is measured what is measured at its start.
+            errors = errors + np.concatenate([added[:1, [0, 0]], added])
         _, _, resolution = plant.sensors.vectors(plant.outputs)
         plant_q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
         given = np.concatenate([plant.start_state, *of_theta, plant_q, resolution, errors[0, 1]])
