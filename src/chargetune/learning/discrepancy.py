@@ -33,6 +33,8 @@ NODES = {1: (101,), 2: (33, 15), 3: (21, 7, 5)}
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
+# Few stretches tell how large errors are: as in Student's quantiles, the fewer there are the wider is what they allow.
+SURE = 0.84
 # Neighbouring stretches that err together.
 TOGETHER = 4.0
 
@@ -96,7 +98,7 @@ class Discrepancy:
 
         Scale: how many times larger than stated the discrepancy is where nothing was measured. Mistake: root mean square of what
         the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
-        The scale is the most probable factor s on its standard deviation d, given by how much r each stretch of the episodes, at
+        The scale is the factor s on its standard deviation d that is not exceeded with probability `SURE`, given by how much r each stretch of the episodes, at
         the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
         Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
         variance that d^2 still is: what was measured before comes out as it was, however wrong the process is elsewhere.
@@ -110,7 +112,8 @@ class Discrepancy:
             variance = scales[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
             chance = chance - 0.5 * np.sum(off.novel[known] * (np.log(variance) + square / variance), axis=1) / TOGETHER
             mistake = float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))) if known.any() else 0.0
-        return float(scales[np.argmax(chance)]), mistake
+        known_to = np.cumsum(np.exp(chance - np.max(chance)))
+        return float(scales[np.searchsorted(known_to, SURE * known_to[-1])]), mistake
 
     def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin
