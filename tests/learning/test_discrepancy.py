@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from two_pairs import TwoPairs
 
 from chargetune.battery.cell import default_cell
@@ -129,7 +130,8 @@ def test_a_repeat_says_nothing_of_elsewhere():
     problem = charge(pairs=True)
     before, _ = beliefs(problem, (4.0, 1.6))
     scale, mistake = before.discrepancy.foretold([problem.episode(np.full(9, 1.6), 7)])
-    assert scale > 0.7
+    # ln s ~ N(0, 1) as before: its 0.84 quantile, on a grid of 8 %.
+    assert scale == pytest.approx(np.exp(norm.ppf(0.84)), rel=0.1)
     assert mistake < 1.0
 
 

@@ -96,10 +96,11 @@ class Discrepancy:
     def foretold(self, episodes: Sequence[Episode]) -> tuple[float, float]:
         """(scale, mistake) of the prediction of episodes that were not learnt from, at their recorded inputs.
 
-        Scale: how many times larger than stated the discrepancy is where nothing was measured. Mistake: root mean square of what
+        Scale: how many times larger than stated the discrepancy may be where nothing was measured. Mistake: root mean square of what
         the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
-        The scale is the factor s on its standard deviation d that is not exceeded with probability `SURE`, given by how much r each stretch of the episodes, at
-        the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns, ln s ~ N(0, 1).
+        The scale is the factor s on its standard deviation d that is not exceeded with probability `SURE`, given by how much r each
+        stretch of the episodes, at the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns,
+        ln s ~ N(0, 1).
         Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
         variance that d^2 still is: what was measured before comes out as it was, however wrong the process is elsewhere.
         """
