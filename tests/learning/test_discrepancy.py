@@ -129,10 +129,12 @@ def test_a_repeat_says_nothing_of_elsewhere():
     """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
     problem = charge(pairs=True)
     before, _ = beliefs(problem, (4.0, 1.6))
-    scale, mistake = before.discrepancy.foretold([problem.episode(np.full(9, 1.6), 7)])
-    # ln s ~ N(0, 1) as before: its 0.84 quantile, on a grid of 8 %.
-    assert scale == pytest.approx(np.exp(norm.ppf(0.84)), rel=0.1)
-    assert mistake < 1.0
+    again = [problem.episode(np.full(9, 1.6), 7)]
+    for sure in (0.5, 0.84):
+        scale, mistake = before.discrepancy.foretold(again, sure)
+        # ln s ~ N(0, 1) as before: its quantile, on a grid of 8 %.
+        assert scale == pytest.approx(np.exp(norm.ppf(sure)), rel=0.1)
+        assert mistake < 1.0
 
 
 @pytest.mark.usefixtures("virtual_machine")

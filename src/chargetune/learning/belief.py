@@ -188,8 +188,11 @@ def episodes_of(trials: Sequence[TrialLike], newest: int | None = None) -> list[
     return [e for reader in readers[-(newest or 0) :] if (e := reader()) is not None and len(e)]
 
 
-def believe(loop: TwinLoop, trials: Sequence[TrialLike]) -> Belief:
-    """What the traces of these trials say; the prior when there is none."""
+def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5) -> Belief:
+    """What the traces of these trials say; the prior when there is none.
+
+    ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell.
+    """
     episodes = tuple(episodes_of(trials, TRACES_MAX))
     scale, mistake, guess = 1.0, 0.0, None
     if len(episodes) > 1:
@@ -197,6 +200,6 @@ def believe(loop: TwinLoop, trials: Sequence[TrialLike]) -> Belief:
         known = max(1, len(episodes) - FORETOLD)
         before = loop.twin.fit(episodes[:known])
         guess = before.mode
-        scale, mistake = Discrepancy(before, episodes[:known], loop.features).foretold(episodes[known:])
+        scale, mistake = Discrepancy(before, episodes[:known], loop.features).foretold(episodes[known:], sure)
     posterior = loop.twin.fit(episodes, guess=guess)
     return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None, mistake)

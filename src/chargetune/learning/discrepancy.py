@@ -33,8 +33,6 @@ NODES = {1: (101,), 2: (33, 15), 3: (21, 7, 5)}
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
-# Few stretches tell how large errors are: as in Student's quantiles, the fewer there are the wider is what they allow.
-SURE = 0.84
 # Neighbouring stretches that err together.
 TOGETHER = 4.0
 
@@ -93,12 +91,12 @@ class Discrepancy:
         each(lambda part: part.root, self._parts)
         return each(self.error, unknowns, seeds)
 
-    def foretold(self, episodes: Sequence[Episode]) -> tuple[float, float]:
+    def foretold(self, episodes: Sequence[Episode], sure: float = 0.5) -> tuple[float, float]:
         """(scale, mistake) of the prediction of episodes that were not learnt from, at their recorded inputs.
 
         Scale: how many times larger than stated the discrepancy may be where nothing was measured. Mistake: root mean square of what
         the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
-        The scale is the factor s on its standard deviation d that is not exceeded with probability `SURE`, given by how much r each
+        The scale is the factor s on its standard deviation d that is not exceeded with probability ``sure``, given by how much r each
         stretch of the episodes, at the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns,
         ln s ~ N(0, 1).
         Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
@@ -114,7 +112,7 @@ class Discrepancy:
             chance = chance - 0.5 * np.sum(off.novel[known] * (np.log(variance) + square / variance), axis=1) / TOGETHER
             mistake = float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))) if known.any() else 0.0
         known_to = np.cumsum(np.exp(chance - np.max(chance)))
-        return float(scales[np.searchsorted(known_to, SURE * known_to[-1])]), mistake
+        return float(scales[np.searchsorted(known_to, sure * known_to[-1])]), mistake
 
     def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin

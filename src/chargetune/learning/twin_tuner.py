@@ -36,6 +36,9 @@ ROUNDS = 7
 SETTLED = 2e-3
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
+# How sure a safe belief is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
+# quantiles, the fewer there are the more is left to allow for.
+SURE = 0.84
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.5
 # Standard deviations that are taken back where nothing is promised; the acquisition chooses, none among them.
@@ -158,7 +161,7 @@ class TwinTuner:
 
     def _safe(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> list[NDArray[np.float64]]:
         """Every theta that is known to be safe enough for the next trial, each once, the most promising first."""
-        belief = believe(self.loop, trials)
+        belief = believe(self.loop, trials, SURE)
         if belief.discrepancy is None:
             # Trials that left no trace have taught nothing.
             return [self._start(space, belief, safety)]
