@@ -46,8 +46,8 @@ def most_promising(
 
     For the objective and for the worst excess of every limit, y(theta) = m(theta) + f(theta) + noise, where m is the score of the
     expected episode (`Belief.central`), f ~ GP(0, s^2 k) with s the rms of y - m over the trials and k as in `GaussianProcess`; the
-    variance at a candidate is that of f plus that of the ensemble. Improvement is over the best trial that kept the limits as
-    measured; while there is none, the probability of keeping them decides. Near failed trials it is lower (`AwayFromFailures`).
+    variance at a candidate is that of f plus that of the ensemble. Improvement is over the best trial that m + f
+    calls kept; while there is none, the probability of keeping them decides. Near failed trials it is lower (`AwayFromFailures`).
     Candidates of which nothing is foretold are passed over. With fewer than `PROVED` trials the first of them is returned: a twin
     reproduces the trial that it was made from. Source of the acquisition: Ament et al., NeurIPS 2023.
     """
