@@ -137,15 +137,10 @@ def test_diffusion_comes_back_where_a_cell_has_it():
     assert misfit(without) > 3 * misfit(posterior)
 
 
-def test_diffusion_is_left_out_of_a_circuit_and_not_of_an_electrochemical_cell():
-    electrochemical = replace(charge(), plant_model=Electrochemical())
-    for problem, diffusion, there in (
-        (charge(), None, False),
-        (charge(), True, True),
-        (electrochemical, None, True),
-        (electrochemical, False, False),
-    ):
-        assert ("soc_lead" in ChargingTwin(problem, diffusion=diffusion).twin.model.state_names) is there
+def test_diffusion_is_there_where_it_is_asked_for():
+    for problem in (charge(), replace(charge(), plant_model=Electrochemical())):
+        for diffusion in (False, True):
+            assert ("soc_lead" in ChargingTwin(problem, diffusion=diffusion).twin.model.state_names) is diffusion
 
 
 def test_the_controller_reads_what_the_twin_cannot_represent():

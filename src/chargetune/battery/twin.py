@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.charging_check import stand_in
 from chargetune.battery.ecm import Diffusion, ecm_model, start_state
-from chargetune.battery.electrochemical import Electrochemical
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
@@ -49,8 +48,8 @@ class ChargingTwin:
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
     nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
     ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
-    With ``diffusion`` the circuit has that too (`Diffusion`), with gain and time constant unknown; by default where the plant is
-    electrochemical. The controller's own model stays as it is.
+    With ``diffusion`` the circuit has that too (`Diffusion`), with gain and time constant unknown. The controller's own model stays
+    as it is.
     """
 
     problem: ChargingProblem
@@ -59,7 +58,7 @@ class ChargingTwin:
     capacity_spread: float = 0.0
     soc_spread: float = 0.0
     ocv_spread_V: float = 0.0
-    diffusion: bool | None = None
+    diffusion: bool = False
 
     @cached_property
     def twin(self) -> Twin:
@@ -84,8 +83,7 @@ class ChargingTwin:
 
     @cached_property
     def _circuit(self) -> Model:
-        electrochemical = isinstance(self.problem.plant_model, Electrochemical)
-        diffusion = DIFFUSION if (electrochemical if self.diffusion is None else self.diffusion) else None
+        diffusion = DIFFUSION if self.diffusion else None
         return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s, diffusion=diffusion)
 
     @property
