@@ -268,7 +268,6 @@ def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
         same(episode, replace(episodes, plant=one).run(theta, 3))
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="an ensemble shares the cores where its loop is compiled")
 @pytest.mark.parametrize("name", ["ideal", "noise", "Kalman filter, delay 1"])
 def test_errors_of_what_is_measured_are_read_by_the_estimator(charging, same, name):
     """A constant error is the bias of a sensor."""
