@@ -104,7 +104,7 @@ def test_a_gap_in_a_feature_is_bridged(name, seen):
     whole, bridged = (
         Discrepancy(believe(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
     )
-    off = np.abs(bridged._signals(holed) - whole._signals(episode)) / [1.0, 6.0, 35.0]
+    off = np.abs(bridged.signals(holed) - whole.signals(episode)) / [1.0, 6.0, 35.0]
     assert np.max(off) < 0.05
     assert np.all(np.isfinite(bridged.error(bridged.posterior.mode)(holed).signal("voltage_V")[1]))
 

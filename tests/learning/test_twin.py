@@ -13,6 +13,7 @@ from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
+from chargetune.episode.lattice import Lattice
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
 from chargetune.learning.belief import believe
 from chargetune.plants.sensors import Sensors
@@ -149,10 +150,8 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
     problem = ChargingProblem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, ratios=(ResistanceRatio("R0"),))
     loop = ChargingTwin(problem)
 
-    def warmer(episode):
-        shift = np.array([0.5 if name == "temperature_K" else 0.0 for name in episode.output_names])
-        return replace(episode, output_start=episode.output_start + shift, output_end=episode.output_end + shift)
-
+    lattice = Lattice.over(loop.features, list(loop.twin.noise_sd))
+    warmer = SimpleNamespace(table=np.tile([[0.5 if name == "temperature_K" else 0.0] for name in lattice.outputs], lattice.size))
     theta = problem.space.default
     predicted = loop.simulate([(theta, np.zeros(27), warmer)])[0]
     # The circuit of the twin is the controller's own: the plant without a mismatch.

@@ -16,12 +16,14 @@ from chargetune.battery.ecm import Diffusion, ecm_model, start_state
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
+from chargetune.episode.lattice import Lattice
 from chargetune.episode.score import Score
 from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
     from chargetune.learning.belief import Case
+    from chargetune.learning.discrepancy import OutputError
     from chargetune.learning.twin import Twin
 
 __all__ = ["ChargingTwin"]
@@ -108,30 +110,20 @@ class ChargingTwin:
         return self.problem.row_tolerances
 
     def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
-        """Charges without noise, with the third of each case added to what is measured.
-
-        Where the estimator reads such an output the charge is simulated twice: the second time it reads the errors of the first.
-        """
+        """Charges without noise, with the third of each case added to what is measured and so to what the estimator reads."""
         thetas, plants = [theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases]
-        out = self._measured(self._loop.run_each(thetas, plants), cases)
-        added = [None if episode is None else _added(episode) for episode in out]
-        if not self._read or not any(one is not None and one.any() for one in added):
-            return out
-        return self._measured(self._loop.run_each(thetas, plants, errors=added), cases)
+        episodes = self._loop.run_each(thetas, plants, tables=[self._table(unknowns, error) for _, unknowns, error in cases])
+        return [episode if episode.ending is Ending.DONE else None for episode in episodes]
 
-    def _measured(self, episodes: Sequence[Episode], cases: Sequence[Case]) -> list[Episode | None]:
-        """What is measured in these episodes, whatever their estimators read; None where one failed."""
-        out: list[Episode | None] = []
-        for episode, (_, unknowns, error) in zip(episodes, cases, strict=True):
-            biased = _shifted(episode.noise_free(), self.twin.biases(unknowns))
-            out.append(None if episode.ending is not Ending.DONE else error(biased) if error else biased)
-        return out
+    def _table(self, unknowns: NDArray[np.float64], error: OutputError | None) -> NDArray[np.float64]:
+        """The error and the constants of the unknowns, both of what is measured, on `_lattice`."""
+        biases = self.twin.biases(unknowns)
+        constants = np.array([biases.get(name, 0.0) for name in self._lattice.outputs])[:, None]
+        return np.tile(constants, self._lattice.size) if error is None else error.table + constants
 
     @cached_property
-    def _read(self) -> bool:
-        """Whether the controller's estimator reads an output that the twin has errors of."""
-        controller = self.problem.controller
-        return not set(controller.estimator.signals(controller.model)).isdisjoint(self.twin.noise_sd)
+    def _lattice(self) -> Lattice:
+        return Lattice.over(self.features, list(self.twin.noise_sd))
 
     def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
         # An ensemble goes through many thetas: its plants are made once.
@@ -179,18 +171,4 @@ class ChargingTwin:
         plant = problem.plant
         if not isinstance(plant, SimulatedPlant):
             raise TypeError("the twin's plant is a simulated circuit")
-        return compiled_episode(self.problem.controller, replace(plant, model=self._circuit), problem.steps)
-
-
-def _shifted(episode: Episode, biases: Mapping[str, float]) -> Episode:
-    """The episode with constants added to its measured outputs."""
-    if not biases:
-        return episode
-    shift = np.array([biases.get(name, 0.0) for name in episode.output_names])
-    return replace(episode, output_start=episode.output_start + shift, output_end=episode.output_end + shift)
-
-
-def _added(episode: Episode) -> NDArray[np.float64]:
-    """What its measured outputs are off by, shape (steps, 2, outputs)."""
-    exact = episode.noise_free()
-    return np.stack([episode.output_start - exact.output_start, episode.output_end - exact.output_end], axis=1)
+        return compiled_episode(self.problem.controller, replace(plant, model=self._circuit), problem.steps, lattice=self._lattice)

@@ -23,6 +23,7 @@ from chargetune.control.mpc import begin, cached, control_step, problem_of
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
+from chargetune.episode.lattice import Lattice
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
@@ -39,6 +40,7 @@ class CompiledEpisode:
     compiled: bool
     function: ca.Function
     prepare_plant: ca.Function
+    lattice: Lattice | None = None
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -56,30 +58,30 @@ class CompiledEpisode:
         thetas: Sequence[ArrayLike | None],
         plants: Sequence[SimulatedPlant],
         seed: int = 0,
-        errors: Sequence[NDArray[np.float64] | None] | None = None,
+        tables: Sequence[NDArray[np.float64] | None] | None = None,
     ) -> list[Episode]:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
         The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
-        ``errors`` are added to what is measured, and so read by the estimator, each of shape (steps, 2, outputs): at both ends of
-        every interval. Raises ValueError when there are not as many of all, or one does not fit.
+        What each of ``tables`` (`Lattice`) says of the true outputs is added to what is measured, and so read by the estimator.
+        Raises ValueError when there are not as many of all, or one does not fit.
         """
-        errors = [None] * len(plants) if errors is None else errors
-        if not len(thetas) == len(plants) == len(errors):
-            raise ValueError(f"{len(thetas)} thetas, {len(plants)} plants and {len(errors)} errors, allowed are as many of each")
+        tables = [None] * len(plants) if tables is None else tables
+        if not len(thetas) == len(plants) == len(tables):
+            raise ValueError(f"{len(thetas)} thetas, {len(plants)} plants and {len(tables)} tables, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
         # An ensemble has few thetas: what depends on theta alone is computed once for each.
         of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
         given, unknown = [], []
-        for theta, plant, added in zip(thetas, plants, errors, strict=True):
+        for theta, plant, table in zip(thetas, plants, tables, strict=True):
             check_run(plant, self.steps, seed, ())
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
                 of_theta[key] = self._of_theta(values)
-            known, unforeseen = self._with_plant(of_theta[key], plant, seed, added)
+            known, unforeseen = self._with_plant(of_theta[key], plant, seed, table)
             given.append(known)
             unknown.append(unforeseen)
         evaluated = partial(_evaluated, self.function, (self.steps, sum(self.widths)))
@@ -101,19 +103,18 @@ class CompiledEpisode:
         return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
 
     def _with_plant(
-        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int, added: NDArray[np.float64] | None = None
+        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int, table: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         errors, process = disturbances(plant, self.steps, seed)
-        if added is not None:
-            expected = (self.steps, 2, len(plant.outputs))
-            if added.shape != expected:
-                raise ValueError(f"errors have the shape {added.shape}, allowed is {expected}: steps, both ends, outputs")
-            # At rest before the first interval is measured what is measured at its start.
-            errors = errors + np.concatenate([added[:1, [0, 0]], added])
         _, _, resolution = plant.sensors.vectors(plant.outputs)
         plant_q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
-        given = np.concatenate([plant.start_state, *of_theta, plant_q, resolution, errors[0, 1]])
-        return given, np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
+        given = [plant.start_state, *of_theta, plant_q, resolution]
+        if self.lattice is not None:
+            nothing = np.zeros((len(self.lattice.outputs), self.lattice.size))
+            given.append(self.lattice.coefficients(nothing if table is None else table))
+        elif table is not None:
+            raise ValueError("a table was given, allowed is none: these episodes were built without a lattice")
+        return np.concatenate([*given, errors[0, 1]]), np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
 
     def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
         controller, start_state = self.controller, plant.start_state
@@ -156,8 +157,10 @@ def _evaluated(
     return recorded
 
 
-def compiled_episode(controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None) -> CompiledEpisode:
-    """The function for this controller and plant, built and compiled once a content.
+def compiled_episode(
+    controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None, lattice: Lattice | None = None
+) -> CompiledEpisode:
+    """The function for this controller and plant, built and compiled once a content; with ``lattice`` it takes tables of errors.
 
     ``compiled=None`` compiles when there is a C compiler, and where that fails warns and uses CasADi's virtual machine,
     which is slower and gives the same result; ``False`` uses the virtual machine; ``True`` raises RuntimeError or
@@ -167,19 +170,19 @@ def compiled_episode(controller: Controller, plant: SimulatedPlant, steps: int, 
     indices = tuple(signal_indices(controller, plant))
     own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.sensors.delay_steps}"
     use = find_compiler() is not None if compiled is None else compiled
-    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices}"
+    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices} {lattice}"
 
     def build() -> tuple[ca.Function, ca.Function, bool]:
         try:
-            return *(_compiled if use else _built)(controller, plant, indices, steps), use
+            return *(_compiled if use else _built)(controller, plant, indices, steps, lattice), use
         except (RuntimeError, OSError) as error:
             if compiled or not use:
                 raise
             warnings.warn(f"episodes run on the virtual machine, about 8 times slower: {error}", RuntimeWarning, stacklevel=4)
-            return *_built(controller, plant, indices, steps), False
+            return *_built(controller, plant, indices, steps, lattice), False
 
     function, prepare, used = cached(key, build)
-    return CompiledEpisode(controller, plant, steps, used, function, prepare)
+    return CompiledEpisode(controller, plant, steps, used, function, prepare, lattice)
 
 
 def simulate(
@@ -214,10 +217,12 @@ def _content(function: ca.Function) -> str:
     return hashlib.sha256(function.serialize().encode()).hexdigest()
 
 
-def _compiled(controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int) -> tuple[ca.Function, ca.Function]:
+def _compiled(
+    controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, lattice: Lattice | None
+) -> tuple[ca.Function, ca.Function]:
     """(the episode as machine code, p -> q of the plant)."""
     problem = problem_of(controller)
-    episode, prepare = _built(controller, plant, indices, steps, daqp_warm)
+    episode, prepare = _built(controller, plant, indices, steps, lattice, daqp_warm)
     generator = ca.CodeGenerator("episode", {"with_header": False})
     generator.add(episode)
     sources, defines = warm_sources(len(controller.limits), problem.size, problem.size + len(problem.groups))
@@ -226,7 +231,12 @@ def _compiled(controller: Controller, plant: SimulatedPlant, indices: tuple[int,
 
 
 def _built(
-    controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, qp: QPSolver = daqp
+    controller: Controller,
+    plant: SimulatedPlant,
+    indices: tuple[int, ...],
+    steps: int,
+    lattice: Lattice | None,
+    qp: QPSolver = daqp,
 ) -> tuple[ca.Function, ca.Function]:
     """(the episode for CasADi's virtual machine, p -> q of the plant)."""
     control = control_step(problem_of(controller), qp)
@@ -238,14 +248,19 @@ def _built(
     memory, last, warm, q = (ca.MX.sym(n, k) for n, k in sizes.items())
     plant_q, resolution = ca.MX.sym("plant_q", prepare.size1_out(0)), ca.MX.sym("resolution", ny)
     error_start, error_end, noise = ca.MX.sym("e0", ny), ca.MX.sym("e1", ny), ca.MX.sym("w", nx)
-    measure = _measure(ny)
+    measure, added = _measure(ny), lattice.function(plant.model.output_names, plant.model.input_names) if lattice else None
+    table = ca.MX.sym("table", added.size1_in(2) if added else 0)
+
+    def errs(y: ca.MX, u: ca.MX, table: ca.MX) -> ca.MX:
+        return added(y, u, table) if added else ca.MX.zeros(ny)
 
     received = sent[:ny]
     u, ahead, following, status, kkt, count, estimate = control(memory, received[list(indices)] if indices else ca.MX(0, 1), last, warm, q)
     after = transition(x, u, plant_q) + noise
     before_y, after_y = output(x, u, plant_q), output(after, u, plant_q)
-    start, end = measure(before_y, error_start, resolution), measure(after_y, error_end, resolution)
-    carried, fixed = [x, memory, last, warm, sent], [q, plant_q, resolution]
+    start = measure(before_y, error_start + errs(before_y, u, table), resolution)
+    end = measure(after_y, error_end + errs(after_y, u, table), resolution)
+    carried, fixed = [x, memory, last, warm, sent], [q, plant_q, resolution, table]
     unknown = ca.vertcat(error_start, error_end, noise)
     unknowns = ca.MX.sym("unknown", unknown.shape[0])
     step = ca.Function("plain_step", [*carried, *fixed, error_start, error_end, noise], [
@@ -255,10 +270,12 @@ def _built(
     parts = ca.vertsplit(unknowns, [0, ny, 2 * ny, 2 * ny + nx])
     step = ca.Function("step", [*carried, *fixed, unknowns], list(step(*carried, *fixed, *parts)))
 
-    first = [x, memory, last, warm, q, plant_q, resolution, ca.MX.sym("e_rest", ny)]
+    first = [x, memory, last, warm, q, plant_q, resolution, table, ca.MX.sym("e_rest", ny)]
     given = ca.MX.sym("given", sum(v.shape[0] for v in first))
     x0, memory0, last0, warm0, *fixed0, error = ca.vertsplit(given, np.cumsum([0, *(v.shape[0] for v in first)]).tolist())
-    rest = measure(output(x0, ca.DM.zeros(len(plant.inputs)), fixed0[1]), error, fixed0[2])
+    nothing = ca.MX.zeros(len(plant.inputs))
+    rest_y = output(x0, nothing, fixed0[1])
+    rest = measure(rest_y, error + errs(rest_y, nothing, fixed0[3]), fixed0[2])
     unknown_matrix = ca.MX.sym("unknown", unknown.shape[0], steps)
     *_, recorded = _repeat(step, len(carried), steps)(x0, memory0, last0, warm0, ca.repmat(rest, delay + 1, 1), *fixed0, unknown_matrix)
     return ca.Function("episode", [given, unknown_matrix], [recorded]), prepare

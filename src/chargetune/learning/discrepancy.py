@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,16 +20,12 @@ from scipy.linalg import cho_factor, cho_solve
 
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
+from chargetune.episode.lattice import Lattice
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.twin import blocks
 
 __all__ = ["Discrepancy", "OutputError"]
 
-OutputError = Callable[[Episode], Episode]
-"""A predicted episode -> the same with what the twin cannot represent added to its outputs."""
-
-# Nodes of the table of a sample along each feature, by the number of features: a sample is drawn at its nodes together.
-NODES = {1: (101,), 2: (33, 15), 3: (21, 7, 5)}
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
@@ -57,12 +53,11 @@ class Discrepancy:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if len(self.features) not in NODES:
-            raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {max(NODES)}")
+        if not 1 <= len(self.features) <= len(LENGTH):
+            raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {len(LENGTH)}")
 
     def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
         """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
-        names = list(self.posterior.twin.noise_sd)
         left = self._residuals(unknowns)
         stream = None if seed is None else np.random.default_rng(seed)
         tables = []
@@ -71,20 +66,7 @@ class Discrepancy:
             if stream is not None:
                 table = table + part.root @ stream.standard_normal(len(table))
             tables.append(table)
-        values = np.stack(tables)
-
-        def add(episode: Episode) -> Episode:
-            columns = [episode.output_names.index(name) for name in names]
-            changed = []
-            at = self._signals(episode)
-            for k, outputs in enumerate((episode.output_start, episode.output_end)):
-                out = outputs.copy()
-                nodes, shares = self._lattice(at[:, k])
-                out[:, columns] += np.sum(values[:, nodes] * shares, axis=-1).T
-                changed.append(out)
-            return replace(episode, output_start=changed[0], output_end=changed[1])
-
-        return add
+        return OutputError(self, np.stack(tables))
 
     def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[OutputError]:
         """A sample of `error` for each of several plants, unknowns of shape (plants, d)."""
@@ -124,36 +106,23 @@ class Discrepancy:
         left, counts = blocks(twin.measured(episode) - twin.measured(filled))
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        weights = self._weights(self._at(episode))
+        weights = self.lattice.weights(self._at(episode))
         unmodelled = np.stack([part.variance(weights) for part in self._parts], axis=1)
         before = np.stack([part.variance_before(weights) for part in self._parts], axis=1)
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
         novel = np.divide(unmodelled, before, out=np.zeros_like(before), where=before > 0)
         return _Off(left**2, unmodelled, novel, rest, (counts > 0) & np.isfinite(left))
 
-    def _lattice(self, at: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """The nodes around each of K features (K, n), and their shares of a value there, both of shape (K, 2^n): linear, held beyond."""
-        unit = np.clip(self._unit(at), 0.0, 1.0)
-        nodes, shares = np.zeros((len(at), 1), dtype=np.intp), np.ones((len(at), 1))
-        for place, count in zip(unit.T * (np.array(self._nodes)[:, None] - 1.0), self._nodes, strict=True):
-            below = np.minimum(place.astype(np.intp), count - 2)[:, None]
-            beyond = place[:, None] - below
-            nodes = np.hstack([nodes * count + below, nodes * count + below + 1])
-            shares = np.hstack([shares * (1.0 - beyond), shares * beyond])
-        return nodes, shares
-
-    def _weights(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`_lattice` as a matrix: values at the nodes -> values at K features, shape (K, nodes)."""
-        nodes, shares = self._lattice(at)
-        out = np.zeros((len(at), int(np.prod(self._nodes))))
-        np.put_along_axis(out, nodes, shares, axis=1)
-        return out
+    @cached_property
+    def lattice(self) -> Lattice:
+        """The nodes at which a sample is drawn together."""
+        return Lattice.over(self.features, list(self.posterior.twin.noise_sd))
 
     def _at(self, episode: Episode) -> NDArray[np.float64]:
         """Mean features of every stretch, shape (stretches, features)."""
-        return blocks(self._signals(episode))[0]
+        return blocks(self.signals(episode))[0]
 
-    def _signals(self, episode: Episode) -> NDArray[np.float64]:
+    def signals(self, episode: Episode) -> NDArray[np.float64]:
         """Features at both ends of every interval, shape (intervals, 2, features).
 
         Where one was not measured it is what the twin predicts, and where the twin does not, what lies between its neighbours.
@@ -173,14 +142,6 @@ class Discrepancy:
             )
         return out
 
-    @property
-    def _nodes(self) -> tuple[int, ...]:
-        return NODES[len(self.features)]
-
-    def _unit(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        low, high = np.array(list(self.features.values())).T
-        return np.asarray((values - low) / (high - low))
-
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean residual of every stretch, shape (n, outputs); 0 where nothing was measured."""
         twin = self.posterior.twin
@@ -192,26 +153,45 @@ class Discrepancy:
         twin = self.posterior.twin
         left = self._residuals(self.posterior.mode)
         counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
-        lattice = np.stack(np.meshgrid(*(np.linspace(0, 1, k) for k in self._nodes), indexing="ij"), axis=-1).reshape(
-            -1, len(self.features)
-        )
+        nodes = self.lattice.nodes
         inputs = [i for i, name in enumerate(self.features) if name in twin.model.input_names]
         low, high = np.array(list(self.features.values())).T
-        sizes = np.abs(low + lattice * (high - low)) / np.maximum(np.abs(low), np.abs(high))
-        size = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(lattice))
+        sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
+        size = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(nodes))
         at = np.concatenate([self._at(episode) for episode in self.episodes])
-        weights = self._weights(at)
+        weights = self.lattice.weights(at)
         return tuple(
             _part(
-                self._unit(at),
+                self.lattice.unit(at),
                 left[:, i],
                 noise**2 / np.maximum(counts[:, i], 1e-9),
-                lattice,
+                nodes,
                 weights,
                 self.scale * twin.error_sd.get(name, 0.0) * size,
             )
             for i, (name, noise) in enumerate(twin.noise_sd.items())
         )
+
+
+@dataclass(frozen=True)
+class OutputError:
+    """What the twin cannot represent of one plant: ``table`` has the shape (outputs, nodes), on ``discrepancy.lattice``."""
+
+    discrepancy: Discrepancy
+    table: NDArray[np.float64]
+
+    def __call__(self, episode: Episode) -> Episode:
+        """A predicted episode -> the same with this added to its outputs."""
+        lattice = self.discrepancy.lattice
+        columns = [episode.output_names.index(name) for name in lattice.outputs]
+        at = self.discrepancy.signals(episode)
+        changed = []
+        for k, outputs in enumerate((episode.output_start, episode.output_end)):
+            out = outputs.copy()
+            nodes, shares = lattice.around(at[:, k])
+            out[:, columns] += np.sum(self.table[:, nodes] * shares, axis=-1).T
+            changed.append(out)
+        return replace(episode, output_start=changed[0], output_end=changed[1])
 
 
 class _Off(NamedTuple):

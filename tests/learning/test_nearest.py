@@ -1,0 +1,46 @@
+"""The nearest theta that promises as much, against its closed form."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from chargetune.episode.score import Score
+from chargetune.learning.nearest import GAIN, nearest
+from chargetune.learning.twin_search import Search
+from chargetune.model.parameters import Parameter, ParameterSpace
+
+SPACE = ParameterSpace((Parameter("speed", 0.0, 2.0, 1.0, size=2), Parameter("unused", -4.0, 4.0, 0.0, size=3)))
+
+
+def search(bend=0.0):
+    """Objective u0 in the unit cube, and a limit u0 - u1 + bend (u0 - 0.5)^2 <= 0.1 with a tolerance of 0.01."""
+
+    def simulate(thetas):
+        return [SPACE.to_unit(theta) for theta in thetas]
+
+    def score(u):
+        return Score(float(u[0]), float(u[0]), {"limit": float(u[0] - u[1] + bend * (u[0] - 0.5) ** 2 - 0.1)}, {"limit": 0.01})
+
+    return Search(SimpleNamespace(score=score), simulate, SPACE)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.4])
+@pytest.mark.parametrize("margin", [0.0, 3.0])
+def test_what_is_needed_moves_and_nothing_else(bend, margin):
+    best, theta = np.array([0.2, 0.3, 1.0, 2.0, 3.0]), np.array([0.6, 0.95, 0.1, 0.9, 0.4])
+    # Both entries of what is needed stay in part: the gain is worth a step of 6e-4, and u1 is as large as the limit asks for.
+    u0 = 0.6 * (1.0 - GAIN)
+    u1 = u0 + bend * (u0 - 0.5) ** 2 - 0.1 + (margin - 1.0) * 0.01
+    expected = np.concatenate([[u0, u1], SPACE.to_unit(best)[2:]])
+    upper = np.array([(0.6 - 0.95 + bend * 0.01 - 0.1) / 0.01 - 1.0 + margin])
+    found = SPACE.to_unit(nearest(search(bend), SPACE, best, SPACE.from_unit(theta), upper))
+    # A tenth of the gain and of the tolerance are rounding.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1.2e-3)
+
+
+def test_a_theta_that_promises_no_more_is_not_worth_a_step():
+    best = np.array([1.2, 1.1, 1.0, 2.0, 3.0])
+    theta = best + np.array([1e-4, 0.1, 0.3, -0.5, 0.2])
+    upper = np.array([-9.0])
+    np.testing.assert_allclose(nearest(search(), SPACE, best, theta, upper), best, rtol=0, atol=1e-9)
