@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.stats import norm
-from two_pairs import TwoPairs
+from two_pairs import AnotherCell, TwoPairs
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
@@ -93,6 +93,29 @@ def test_between_the_nodes_of_a_coarse_table_a_sample_is_as_sure():
     far = drawn_voltages(belief, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
     assert len(belief.loop.features) == 3
     assert far > 20 * near
+
+
+def test_the_error_of_a_state_does_not_jump_with_the_input():
+    belief, _ = beliefs(charge(pairs=True, cell=WARM), (4.0,))
+    tables = {
+        name: table.reshape(belief.discrepancy.lattice.counts)
+        for name, table in zip(belief.discrepancy.lattice.outputs, belief.discrepancy.error(belief.posterior.mode, 3).table, strict=True)
+    }
+    steps = {name: np.max(np.abs(np.diff(table, axis=1))) for name, table in tables.items()}
+    assert steps["temperature_K"] < 1e-3 * np.ptp(tables["temperature_K"])
+    assert steps["voltage_V"] > 0.1 * np.ptp(tables["voltage_V"])
+
+
+def test_a_temperature_at_its_limit_is_foretold():
+    """The cell heats faster and cools better than its model, and its temperature was held at the limit once."""
+    other = replace(CELL, thermal=Thermal(heat_capacity_J_K=38.0, cooling_W_K=0.13))
+    problem = charge(pairs=False, cell=WARM, temperature_max_K=302.0, steps=240)
+    problem = replace(problem, plant_model=AnotherCell(other))
+    belief, episodes = beliefs(problem, (1.0,))
+    highest = np.max(episodes[0].signal("temperature_K")[1])
+    assert abs(highest - 302.0) < 0.1
+    drawn = belief.predict(np.full(9, 1.0), 16, 0).episodes
+    np.testing.assert_allclose([np.max(e.signal("temperature_K")[1]) for e in drawn], highest, rtol=0, atol=0.05)
 
 
 @pytest.mark.parametrize(("name", "seen"), [("temperature_K", True), ("temperature_K", False), ("soc", True)])

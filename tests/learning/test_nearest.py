@@ -33,8 +33,7 @@ def test_what_is_needed_moves_and_nothing_else(bend, margin):
     u0 = 0.6 * (1.0 - GAIN)
     u1 = u0 + bend * (u0 - 0.5) ** 2 - 0.1 + (margin - 1.0) * 0.01
     expected = np.concatenate([[u0, u1], SPACE.to_unit(best)[2:]])
-    upper = np.array([(0.6 - 0.95 + bend * 0.01 - 0.1) / 0.01 - 1.0 + margin])
-    found = SPACE.to_unit(nearest(search(bend), SPACE, best, SPACE.from_unit(theta), upper))
+    found = SPACE.to_unit(nearest(search(bend), SPACE, best, SPACE.from_unit(theta), 0.6, np.array([-margin])))
     # A tenth of the gain and of the tolerance are rounding.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1.2e-3)
 
@@ -42,5 +41,5 @@ def test_what_is_needed_moves_and_nothing_else(bend, margin):
 def test_a_theta_that_promises_no_more_is_not_worth_a_step():
     best = np.array([1.2, 1.1, 1.0, 2.0, 3.0])
     theta = best + np.array([1e-4, 0.1, 0.3, -0.5, 0.2])
-    upper = np.array([-9.0])
-    np.testing.assert_allclose(nearest(search(), SPACE, best, theta, upper), best, rtol=0, atol=1e-9)
+    found = nearest(search(), SPACE, best, theta, float(SPACE.to_unit(theta)[0]), np.zeros(1))
+    np.testing.assert_allclose(found, best, rtol=0, atol=1e-9)

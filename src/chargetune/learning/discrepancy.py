@@ -39,7 +39,8 @@ class Discrepancy:
 
     s are ``features`` of an episode, signals with the range by which they are scaled: for a charge the SOC, the current and,
     where it is measured, the temperature. The data are residuals, averaged over `BLOCKS` stretches of each episode, because
-    neighbouring residuals have the same cause. For a draw of the twin's unknowns the process is conditioned on that draw's own
+    neighbouring residuals have the same cause. The error of an output that is a state does not depend on the inputs among the features:
+    it has the inertia of the state. For a draw of the twin's unknowns the process is conditioned on that draw's own
     residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
     k is known at the nodes of a table and linear in between, k(s, s') = w(s)' K w(s') with the shares w of the nodes around s, so
     that a sample drawn at the nodes is one of this process (Wilson and Nickisch, ICML 2015).
@@ -154,23 +155,21 @@ class Discrepancy:
         left = self._residuals(self.posterior.mode)
         counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
         nodes = self.lattice.nodes
-        inputs = [i for i, name in enumerate(self.features) if name in twin.model.input_names]
-        low, high = np.array(list(self.features.values())).T
-        sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
-        size = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs else np.ones(len(nodes))
         at = np.concatenate([self._at(episode) for episode in self.episodes])
         weights = self.lattice.weights(at)
-        return tuple(
-            _part(
-                self.lattice.unit(at),
-                left[:, i],
-                noise**2 / np.maximum(counts[:, i], 1e-9),
-                nodes,
-                weights,
-                self.scale * twin.error_sd.get(name, 0.0) * size,
-            )
-            for i, (name, noise) in enumerate(twin.noise_sd.items())
-        )
+        inputs = np.array([name in twin.model.input_names for name in self.features])
+        low, high = np.array(list(self.features.values())).T
+        sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
+        flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs.any() else np.ones(len(nodes))
+        parts = []
+        for i, (name, noise) in enumerate(twin.noise_sd.items()):
+            # A state does not jump with the input, and neither does what the twin has wrong of it.
+            inert = name in twin.model.state_names and not inputs.all()
+            on = np.where(inputs & inert, 0.0, 1.0)
+            least = self.scale * twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if inert else flowing)
+            variance = noise**2 / np.maximum(counts[:, i], 1e-9)
+            parts.append(_part(self.lattice.unit(at) * on, left[:, i], variance, nodes * on, weights, least))
+        return tuple(parts)
 
 
 @dataclass(frozen=True)

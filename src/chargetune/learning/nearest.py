@@ -14,8 +14,8 @@ __all__ = ["nearest"]
 
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
-# Runs of entries that go back, one after the other; ways back that are simulated together; iterations from there.
-BACKS, TOGETHER, ITERATIONS = 3, 16, 8
+ITERATIONS = 10
+# From afar SLSQP may end beside what is allowed: then a part of that way may do.
 PARTS = (0.8, 0.6, 0.4, 0.2)
 # Windows further inside their limits than so many tolerances say nothing.
 FAR = 1000.0
@@ -27,35 +27,31 @@ def nearest(
     search: Search,
     space: ParameterSpace,
     best: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    start: NDArray[np.float64],
+    promised: float,
+    allowed: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """The theta nearest to ``best``, the best trial's, that promises as much as ``theta`` does.
+    """The theta nearest to ``best``, the best trial's, that promises an objective of ``promised``, as ``start`` about does.
 
-    min |u - u_best|^2 in the unit cube  s.t.  objective >= that of theta, less the share `GAIN` of its size, and
-    excess + margin <= 0 in every window, or <= what it is at theta. First whole runs of neighbouring entries go back, the longest
-    first, since the way may be far; from there SLSQP with finite differences.
+    min |u - u_best|^2 in the unit cube  s.t.  objective >= promised, less the share `GAIN` of its size, and
+    excess <= allowed in every window, in tolerances beyond the tolerance (`windows_of`), by SLSQP with finite differences.
 
     A change is a step into what has not been seen: entries that what is aimed at does not need stay where they were tried.
-    ``upper`` is the upper side of the excess by window at ``theta``, in tolerances; its distance to what is expected there is
-    held as margin. ``search`` simulates the expected plant. Where no other point is found, it is ``theta``.
+    ``search`` simulates the expected plant, so that ``allowed`` is to hold the margins. Where no point is found it is ``start``.
     """
-    start, to = space.to_unit(theta), space.to_unit(best)
-    own = search.score(start)
-    if own is None:
-        return theta
-    margin = np.nan_to_num(upper - windows_of(own))
-    most = float(np.nanmax(windows_of(own) + margin, initial=0.0))
-    worth = GAIN * abs(own.objective) or GAIN
+    first, to = space.to_unit(start), space.to_unit(best)
+    if search.score(first) is None:
+        return start
+    worth = GAIN * abs(promised) or GAIN
     seen: dict[bytes, float] = {}
 
     def left(u: NDArray[np.float64]) -> NDArray[np.float64]:
         """What is left to every window, in tolerances, and to the objective, in what a risk is worth."""
         score = search.score(u)
         if score is None:
-            return np.full(margin.size + 1, -FAR)
-        room = np.nan_to_num(most - margin - windows_of(score), nan=FAR)
-        return np.append(np.clip(room, -FAR, FAR), (score.objective - own.objective) / worth + 1.0)
+            return np.full(allowed.size + 1, -FAR)
+        room = np.nan_to_num(allowed - windows_of(score), nan=FAR)
+        return np.append(np.clip(room, -FAR, FAR), (score.objective - promised) / worth + 1.0)
 
     def constraint(u: NDArray[np.float64]) -> NDArray[np.float64]:
         values = left(u)
@@ -67,44 +63,20 @@ def nearest(
         steps = np.where(u + STEP <= 1.0, STEP, -STEP)
         around = [u + step for step in np.diag(steps)]
         search.scores(around)
-        return np.stack([left(ahead) - left(u) for ahead in around], axis=1) / steps
+        values, beyond = left(u)[:, None], np.stack([left(ahead) for ahead in around], axis=1)
+        # A window that is entered or left by a step has no slope.
+        return np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
 
-    runs = _runs(space)
-    for _ in range(BACKS):
-        moved = [np.concatenate([start[:i], to[i:j], start[j:]]) for i, j in runs]
-        way = [float(np.sum(np.abs(one - start))) for one in moved]
-        order = [i for i in np.argsort([-w for w in way], kind="stable") if way[i] > 0]
-        longest = None
-        for first in range(0, len(order), TOGETHER):
-            some = order[first : first + TOGETHER]
-            search.scores([moved[i] for i in some])
-            longest = next((moved[i] for i in some if np.min(constraint(moved[i])) >= 0.0), None)
-            if longest is not None:
-                break
-        if longest is None:
-            break
-        start = longest
     end = minimize(
         lambda u: 0.5 * float(np.sum((u - to) ** 2)),
-        start,
+        first,
         jac=lambda u: u - to,
         method="SLSQP",
-        bounds=[(0.0, 1.0)] * start.size,
+        bounds=[(0.0, 1.0)] * first.size,
         constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
         options={"maxiter": ITERATIONS, "ftol": 1e-7},
     ).x
-    # From afar it may end beside what is allowed; then a part of that way may do.
     for share in PARTS:
-        constraint(start + share * (end - start))
+        constraint(first + share * (end - first))
     found = min(seen, key=lambda key: seen[key], default=None)
-    return theta if found is None else space.from_unit(np.frombuffer(found))
-
-
-def _runs(space: ParameterSpace) -> list[tuple[int, int]]:
-    """First and one past the last entry of every run of neighbours, and of all of theta.
-
-    Neighbours are nodes of one curve, and one of them alone would bend it; entries of two parameters are no neighbours.
-    """
-    out = [(i, j) for s in space.slices.values() for i in range(s.start, s.stop) for j in range(i + 1, s.stop + 1)]
-    whole = (0, space.dimension)
-    return out if whole in out else [*out, whole]
+    return start if found is None else space.from_unit(np.frombuffer(found))

@@ -51,8 +51,10 @@ WIDER = 1.25
 APART = 0.1
 # Iterations of the search that ends it.
 POLISHING = 8
-# Shares of the way to the nearest theta that promises as much: the longest that is safe is gone.
-NEARER = (1.0, 0.8, 0.5)
+# Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
+NEARINGS = 3
+# Shares of the way there: the longest that is safe is gone where none of these was.
+PARTS = (0.8, 0.5)
 # Of a limit's tolerance, what the upper side of the prediction may use.
 AIMED = 0.5
 
@@ -199,14 +201,41 @@ class TwinTuner:
         theta, predicted = most_promising(belief, space, trials, candidates, seed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
         others = [other for other, _ in candidates if belief.proved and not np.array_equal(other, theta)]
-        upper, search = predicted.upper_windows(deviations), Search(self.loop, belief.expected, space)
-        for known in _kept(trials)[:1]:
-            near = nearest(search, space, known, theta, upper)
-            for share in NEARER:
-                nearer = theta + share * (near - theta)
-                if _predicted(belief, nearer, seed).probability() >= safety.probability:
-                    return [nearer, *others]
-        return [theta, *others]
+        near = self._nearer(space, belief, trials, theta, predicted, deviations, safety, seed)
+        return [near, *others]
+
+    def _nearer(
+        self,
+        space: ParameterSpace,
+        belief: Belief,
+        trials: Sequence[TrialLike],
+        theta: NDArray[np.float64],
+        predicted: Prediction,
+        deviations: float,
+        safety: Safety,
+        seed: int,
+    ) -> NDArray[np.float64]:
+        """Of the safe thetas that promise as much as ``theta`` the nearest to the best trial's, or one on the way to it."""
+        search = Search(self.loop, belief.expected, space)
+        score, known = search.score(space.to_unit(theta)), _kept(trials)
+        if score is None or not known:
+            return theta
+        margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
+        allowed = np.nanmax(windows_of(score) + margin, initial=0.0) - margin
+        near = theta
+        for _ in range(NEARINGS):
+            near = nearest(search, space, known[0], near, score.objective, allowed)
+            there, expected = _predicted(belief, near, seed), search.score(space.to_unit(near))
+            if there.probability() >= safety.probability:
+                return near
+            if expected is not None:
+                # It is less sure there, of some limits: those keep the margins of there.
+                allowed = np.minimum(allowed, -np.nan_to_num(there.upper_windows(deviations) - windows_of(expected)))
+        for share in PARTS:
+            part = theta + share * (near - theta)
+            if _predicted(belief, part, seed).probability() >= safety.probability:
+                return part
+        return theta
 
     def _polished(
         self,
