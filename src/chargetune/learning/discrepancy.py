@@ -22,15 +22,13 @@ from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.episode.lattice import Lattice
 from chargetune.learning.posterior import Posterior
-from chargetune.learning.twin import blocks
+from chargetune.learning.twin import TOGETHER, blocks
 
 __all__ = ["Discrepancy", "OutputError"]
 
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
-# Neighbouring stretches that err together.
-TOGETHER = 4.0
 
 
 @dataclass(frozen=True)

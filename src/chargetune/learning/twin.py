@@ -32,6 +32,8 @@ __all__ = ["BLOCKS", "Twin", "Uncertain", "blocks"]
 REFITS = 2
 # Stretches of an episode over which residuals are averaged: what a model cannot represent changes slowly.
 BLOCKS = 40
+# Neighbouring stretches that err together: so many count as one.
+TOGETHER = 4.0
 # Intervals of the shortest roll-out that is built; longer ones are this times a power of two.
 SHORTEST = 45
 # A step that changes the misfit, or the unknowns, by less than this is the last one.
@@ -169,7 +171,7 @@ class Twin:
 
         With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with
         the variance it adds. Where the means of whole stretches are not zero, neighbouring residuals have one cause, and all
-        samples of a stretch together count as one. ``guess`` is where the search for the mode begins. Without episodes it is
+        samples of `TOGETHER` stretches count as one. ``guess`` is where the search for the mode begins. Without episodes it is
         the prior.
         """
         names, factor = list(self.noise_sd), self.prior_factor
@@ -253,7 +255,7 @@ def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> 
     square = np.concatenate([r.reshape(-1, len(noise)) for r in left]) ** 2
     whole = np.maximum(np.nanmean(np.where(np.isfinite(square).any(axis=0), square, 0.0), axis=0) - noise**2, slow)
     together = counts.sum(axis=0) / size
-    return np.sqrt(whole), np.sqrt(noise**2 + together * slow + (whole - slow))
+    return np.sqrt(whole), np.sqrt(noise**2 + TOGETHER * together * slow + (whole - slow))
 
 
 class _Key:
