@@ -41,13 +41,13 @@ from chargetune.learning.tuner import sobol_points
 from chargetune.learning.twin_search import Search
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0
-NEWEST, BELIEVED = ("safe", "safe-diffusion", "ilc"), ("twin", "composite")
+NEWEST, BELIEVED = ("safe", "ilc"), ("twin", "composite")
 
 
-def _safe(problem: Any, seed: int, *, diffusion: bool = False) -> Any:
+def _safe(problem: Any, seed: int) -> Any:
     # The corner that is declared safe: largest resistances, largest backoff.
     start = tuple(float(v) for v in problem.space.upper)
-    return learning.TwinTuner(replace(_twin(problem), diffusion=diffusion), seed=seed, safety=learning.Safety(start=start))
+    return learning.TwinTuner(_twin(problem), seed=seed, safety=learning.Safety(start=start))
 
 
 def _twin(problem: Any) -> ChargingTwin:
@@ -57,7 +57,6 @@ def _twin(problem: Any) -> ChargingTwin:
 
 METHODS = {
     "safe": _safe,
-    "safe-diffusion": partial(_safe, diffusion=True),
     "twin": lambda problem, seed: learning.TwinTuner(_twin(problem), seed=seed),
     "ilc": lambda problem, _: learning.Envelope(_twin(problem)),
     "composite": lambda problem, seed: learning.Composite(ChargingWindows(problem), seed=seed),

@@ -20,7 +20,6 @@ from chargetune.report.style import BLUE, GREEN, GREY, ORANGE, PAGE_IN, RED, che
 
 LOOKS: dict[str, dict[str, Any]] = {
     "safe": {"color": BLUE, "marker": "o"},
-    "safe-diffusion": {"color": BLUE, "marker": "v", "linestyle": "--"},
     "twin": {"color": GREEN, "marker": "s"},
     "composite": {"color": ORANGE, "marker": "^"},
     "ilc": {"color": BLUE, "linestyle": ":"},

@@ -11,8 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from chargetune.battery.cell import default_cell, mismatched
-from chargetune.battery.ecm import Diffusion, ecm_model, table_nodes
-from chargetune.battery.thermal import Thermal
+from chargetune.battery.ecm import ecm_model, table_nodes
 
 STEP = 10.0
 CELL = default_cell()
@@ -69,28 +68,6 @@ def test_voltage(z, u1, current):
     r0, _, _ = tables(CELL, z)
     expected = float(PchipInterpolator(CELL.ocv_soc, CELL.ocv_V)(z)) + u1 + r0 * current
     np.testing.assert_allclose(outputs([z, u1], current), [expected, z, u1], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("thermal", [None, Thermal(40.0, 0.1, 310.0, 298.15, 20_000.0)], ids=["isothermal", "warm"])
-def test_the_surface_runs_ahead_of_the_mean(thermal):
-    """A constant current against the closed form: the lead rises to gain dz/dt as 1 - exp(-t / tau), and V reads the OCV there."""
-    cell, current, steps = replace(CELL, thermal=thermal), 3.0, 20
-    gain, tau = 200.0, 120.0
-    model, plain = ecm_model(cell, STEP, diffusion=Diffusion(gain, tau)), ecm_model(cell, STEP)
-    ambient = [] if thermal is None else [thermal.ambient_K]
-    x, y = np.array([0.2, 0.0, 0.0, *ambient]), np.array([0.2, 0.0, *ambient])
-    # Warm particles diffuse as much faster as their resistance is lower; the cell is held at its ambient.
-    factor = 1.0 if thermal is None else float(np.exp(20_000.0 / 8.314462618 * (1 / 310.0 - 1 / 298.15)))
-    for _ in range(steps):
-        x, y = following(x, current, model), following(y, current, plain)
-        x[3:], y[2:] = ambient, ambient
-    ahead = factor * gain * current / (3600 * CELL.capacity_Ah) * (1 - np.exp(-steps * STEP / (factor * tau)))
-    assert model.state_names[2] == "soc_lead"
-    assert x[2] == pytest.approx(ahead, rel=1e-9)
-    ocv = PchipInterpolator(CELL.ocv_soc, CELL.ocv_V)
-    more = outputs(x, current, model)[0] - outputs(y, current, plain)[0]
-    assert more == pytest.approx(float(ocv(x[0] + ahead) - ocv(x[0])), abs=1e-9)
-    assert more > 0.01
 
 
 @pytest.mark.parametrize("cell", [CELL, mismatched(CELL, 3)], ids=["true", "wrong"])

@@ -10,7 +10,6 @@ from two_pairs import AnotherCell
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.ecm import ecm_model, start_state
-from chargetune.battery.electrochemical import Electrochemical
 from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.lattice import Lattice
@@ -115,33 +114,6 @@ def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
     off = np.abs(posterior.mode - true)[-3:] / np.sqrt(np.diag(posterior.covariance))[-3:]
     assert np.all(off < 3)
     assert np.all(np.sqrt(np.diag(posterior.covariance))[-3:] < [0.02, 0.01, 0.005])
-
-
-@pytest.mark.usefixtures("virtual_machine")
-def test_diffusion_comes_back_where_a_cell_has_it():
-    """The surface of the particles runs ahead of their mean: gain and time constant of another circuit's charge."""
-    loop = ChargingTwin(charge(seed=2), diffusion=True)
-    names = list(loop.twin.model.parameter_blocks)[-2:]
-    assert [one.name for one in loop.twin.unknowns[-2:]] == names == ["diffusion_gain_s", "diffusion_time_constant_s"]
-    true = np.append(np.zeros(27), [0.5, 0.4])
-    episodes = loop.simulate([(theta, true, None) for theta in (loop.problem.space.default, loop.problem.space.upper)])
-    posterior = loop.twin.fit(episodes)
-    sd = np.sqrt(np.diag(posterior.covariance))[-2:]
-    assert np.all(sd < [0.5, 0.5])
-    assert np.all(np.abs(posterior.mode - true)[-2:] < 2 * sd)
-    without = ChargingTwin(charge(seed=2)).twin.fit(episodes)
-
-    def misfit(fitted):
-        return max(np.max(np.abs(fitted.twin.predict(fitted.mode, e.input) - fitted.twin.measured(e))[..., 0]) for e in episodes)
-
-    assert misfit(posterior) < 1e-3
-    assert misfit(without) > 3 * misfit(posterior)
-
-
-def test_diffusion_is_there_where_it_is_asked_for():
-    for problem in (charge(), replace(charge(), plant_model=Electrochemical())):
-        for diffusion in (False, True):
-            assert ("soc_lead" in ChargingTwin(problem, diffusion=diffusion).twin.model.state_names) is diffusion
 
 
 def test_the_controller_reads_what_the_twin_cannot_represent():

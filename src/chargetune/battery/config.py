@@ -227,14 +227,12 @@ class TwinTable(_Table):
     """What is unknown of the plant before the first trial, as standard deviations: for the tuner "twin".
 
     ``resistance_spread`` is that of the logarithm of every R and C, ``capacity_spread`` relative, 0 is known exactly.
-    ``diffusion``: the circuit is given the diffusion in the particles too.
     """
 
     resistance_spread: float = Field(default=0.4, gt=0.0, le=2.0)
     capacity_spread: float = Field(default=0.0, ge=0.0, le=0.3)
     soc_spread: float = Field(default=0.0, ge=0.0, le=0.3)
     ocv_spread_V: float = Field(default=0.0, ge=0.0, le=0.1)
-    diffusion: bool = False
 
 
 class Config(_Table):
@@ -320,8 +318,6 @@ class Config(_Table):
         for name in ("safety", "twin"):
             if data[name] is None:
                 del data[name]
-        if self.twin and not self.twin.diffusion:
-            del data["twin"]["diffusion"]
         return data
 
     def _cell(self, folder: Path | None) -> Cell:

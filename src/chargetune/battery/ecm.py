@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -12,22 +11,9 @@ from chargetune.battery.cell import Cell
 from chargetune.model.model import Model, Named, Signal
 from chargetune.model.splines import natural_spline, pchip
 
-__all__ = ["Diffusion", "ecm_model", "overpotentials", "start_state", "table_nodes"]
+__all__ = ["ecm_model", "overpotentials", "start_state", "table_nodes"]
 
 FLOOR = 1e-3
-LEAD = "soc_lead"
-
-
-@dataclass(frozen=True)
-class Diffusion:
-    """How the SOC w at the surface of the particles runs ahead of their mean z: w - z settles at ``gain_s`` times dz/dt.
-
-    For one kind of spheres of radius R and diffusivity D it is R^2 / (15 D), and the slowest mode has R^2 / (20.2 D) as
-    ``time_constant_s`` (Carslaw and Jaeger, Conduction of Heat in Solids, 1959, section 9.8); a cell has two kinds of them.
-    """
-
-    gain_s: float
-    time_constant_s: float
 
 
 def table_nodes(soc: tuple[float, ...]) -> list[float]:
@@ -45,9 +31,7 @@ def start_state(cell: Cell, soc: float) -> dict[str, float]:
     return {"soc": soc} | ({"temperature_K": cell.thermal.ambient_K} if cell.thermal else {})
 
 
-def ecm_model(
-    cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, float] | None = None, diffusion: Diffusion | None = None
-) -> Model:
+def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, float] | None = None) -> Model:
     """n-RC circuit of a cell, current I charge-positive (A), states z = SOC and U1 .. Un (V), output V.
 
         z+  = z + eta Ts / (3600 Q) I
@@ -66,16 +50,10 @@ def ecm_model(
         T+  = T_e + (T - T_e) exp(-Ts hA / C),   T_e = T_ambient + Q / hA
 
     and all resistances are multiplied by s(T). A cell with an ``anode`` table has the output anode_potential_V.
-    With ``diffusion`` there is the state d = w - z, with gain g and time constant tau both multiplied by s(T), and V has
-    OCV(z + d) in place of OCV(z), which makes a resistance that follows the slope of the OCV:
-
-        d+  = (d - g I / (3600 Q)) exp(-Ts / tau) + g I / (3600 Q)
-
     ``settings`` are further run-time parameters that f and h do not read, for an estimator that does.
     """
     nodes = table_nodes(cell.soc)
     low, high = int(cell.soc[0] > 0.0), int(cell.soc[-1] < 1.0)
-    lead = (LEAD,) if diffusion else ()
     thermal, anode, pairs = cell.thermal, cell.anode, dict(zip(cell.pairs, overpotentials(cell), strict=True))
 
     def table(z: ca.SX, values: ca.SX) -> Any:
@@ -95,13 +73,7 @@ def ecm_model(
             settled = r * factor * current
             following[name] = (x[name] - settled) * ca.exp(-sampling_time_s / (r * c)) + settled
             polarised += x[name]
-        resting = pchip(z, cell.ocv_soc, cell.ocv_V)
-        if diffusion:
-            settled = p["diffusion_gain_s"] * factor / 3600 / p["capacity_Ah"] * current
-            decay = ca.exp(-sampling_time_s / (p["diffusion_time_constant_s"] * factor))
-            following[LEAD] = (x[LEAD] - settled) * decay + settled
-            polarised += pchip(z + x[LEAD], cell.ocv_soc, cell.ocv_V) - resting
-        outputs = {"voltage_V": resting + polarised, "soc": z, **{name: x[name] for name in (*pairs.values(), *lead)}}
+        outputs = {"voltage_V": pchip(z, cell.ocv_soc, cell.ocv_V) + polarised, "soc": z, **{name: x[name] for name in pairs.values()}}
         if thermal:
             temperature = x["temperature_K"]
             heat = current * polarised + current * temperature * p["entropic_V_K"]
@@ -115,16 +87,14 @@ def ecm_model(
             )
         return following, outputs
 
-    states = [Signal("soc"), *(Signal(name, "V") for name in pairs.values()), *(Signal(name) for name in lead)]
+    states = [Signal("soc"), *(Signal(name, "V") for name in pairs.values())]
     of_thermal = ("heat_capacity_J_K", "cooling_W_K", "ambient_K", "reference_K", "activation_J_mol", "entropic_V_K")
     parameters: dict[str, Any] = {name: getattr(cell, name) for name in (*cell.tables, "capacity_Ah", "coulombic_efficiency")}
-    if diffusion:
-        parameters |= {"diffusion_gain_s": diffusion.gain_s, "diffusion_time_constant_s": diffusion.time_constant_s}
     if thermal:
         states.append(Signal("temperature_K", "K"))
         parameters |= {name: getattr(thermal, name) for name in of_thermal}
     return Model.build(
-        f"{'R-' + 'RC' * len(pairs)} circuit{' with diffusion' if diffusion else ''}{' with temperature' if thermal else ''}",
+        f"{'R-' + 'RC' * len(pairs)} circuit{' with temperature' if thermal else ''}",
         states=states,
         inputs=(Signal("current_A", "A"),),
         outputs=(Signal("voltage_V", "V"), *states, *([Signal("anode_potential_V", "V")] if anode else [])),

@@ -56,7 +56,6 @@ def make_tuner(
         capacity_spread=known.capacity_spread,
         soc_spread=known.soc_spread,
         ocv_spread_V=known.ocv_spread_V,
-        diffusion=known.diffusion,
     )
     if safety and twin.unpredicted:
         raise ValueError(

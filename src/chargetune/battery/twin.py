@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.charging_check import stand_in
-from chargetune.battery.ecm import Diffusion, ecm_model, start_state
+from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
@@ -34,9 +34,6 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
-# Of spheres with R^2 / D = 2300 and 6100 s, such as 5 um and 1e-14 m^2/s; diffusivities differ by orders of magnitude, and so does
-# the standard deviation of the logarithm. Fitted to the DFN: 230 to 330 s and 380 to 680 s.
-DIFFUSION, DIFFUSION_SPREAD = Diffusion(150.0, 300.0), {"diffusion_gain_s": 1.0, "diffusion_time_constant_s": 0.7}
 # Plants that are remembered: those of two ensembles.
 PLANTS_KEPT = 128
 # Windows of the SOC in which a predicted excess is told to the search.
@@ -50,8 +47,6 @@ class ChargingTwin:
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
     nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
     ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
-    With ``diffusion`` the circuit has that too (`Diffusion`), with gain and time constant unknown. The controller's own model stays
-    as it is.
     """
 
     problem: ChargingProblem
@@ -60,7 +55,6 @@ class ChargingTwin:
     capacity_spread: float = 0.0
     soc_spread: float = 0.0
     ocv_spread_V: float = 0.0
-    diffusion: bool = False
 
     @cached_property
     def twin(self) -> Twin:
@@ -74,7 +68,6 @@ class ChargingTwin:
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
-        unknowns += [Uncertain(name, sd) for name, sd in DIFFUSION_SPREAD.items() if name in model.parameter_blocks]
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
@@ -85,8 +78,7 @@ class ChargingTwin:
 
     @cached_property
     def _circuit(self) -> Model:
-        diffusion = DIFFUSION if self.diffusion else None
-        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s, diffusion=diffusion)
+        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
