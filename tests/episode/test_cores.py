@@ -1,7 +1,9 @@
 """Work on all cores gives what one core gives, in its order."""
 
+import multiprocessing
 import os
 import threading
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
@@ -24,3 +26,14 @@ def test_an_exception_comes_out():
 
     with pytest.raises(ValueError, match="three"):
         each(refuse, range(10))
+
+
+def test_within_one_of_its_threads_it_goes_on_there():
+    assert each(lambda k: each(lambda n: n * k, range(3)), range(2 * usable_cores())) == [[0, k, 2 * k] for k in range(2 * usable_cores())]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_has_threads_of_its_own():
+    each(abs, range(4))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+        assert pool.submit(each, abs, range(-4, 0)).result(timeout=60) == [4, 3, 2, 1]

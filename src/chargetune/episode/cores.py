@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import TypeVar
 
 __all__ = ["each", "usable_cores"]
 
 Result = TypeVar("Result")
+
+NAME = "chargetune-core"
 
 
 def usable_cores() -> int:
@@ -18,6 +22,16 @@ def usable_cores() -> int:
 
 
 def each(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
-    """``list(map(function, *arguments))``, in as many threads as there are cores; the first exception is raised."""
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        return list(threads.map(function, *arguments))
+    """``list(map(function, *arguments))``, in as many threads as there are cores; the first exception is raised.
+
+    Within such a thread it is what it says: the others are at work already.
+    """
+    if threading.current_thread().name.startswith(NAME):
+        return list(map(function, *arguments))
+    return list(_threads(usable_cores(), os.getpid()).map(function, *arguments))
+
+
+@lru_cache(maxsize=1)
+def _threads(count: int, process: int) -> ThreadPoolExecutor:
+    """Kept, because to start a thread takes as long as a closed loop. By process, because a fork has none of its parent's threads."""
+    return ThreadPoolExecutor(count, f"{NAME} of {process}")
