@@ -46,6 +46,17 @@ def test_the_objective_may_be_the_time_of_charge():
     assert score.performance == score_of(problem(mismatch_seed=None)).performance
 
 
+@pytest.mark.parametrize(("mark", "name"), [(None, "t95"), (0.8, "t80"), (0.85, "t85")])
+def test_the_charging_time_that_is_told_is_the_one_that_is_the_objective(mark, name):
+    p = problem(mismatch_seed=None, charge_time_to_soc=mark)
+    _, episode, _ = p(p.space.default, 0)
+    start, end = p.soc_start, episode.signal("soc")[1]
+    crossing = np.interp(mark or 0.95, [start, *end], np.arange(end.size + 1)) * p.sampling_time_s / 60
+    assert p.charge_time(score_of(p)) == (name, pytest.approx(crossing, abs=1e-9))
+    late = replace(p, soc_start=0.05, steps=60)
+    assert late.charge_time(score_of(late)) == (name, None)
+
+
 def test_a_charge_that_does_not_get_there_is_worse_the_less_it_charges():
     found = [score_of(problem(mismatch_seed=None, charge_time_to_soc=0.9, soc_start=soc, steps=120)) for soc in (0.05, 0.2, 0.3, 0.7, 0.8)]
     assert [s.metrics["t90_min"] is None for s in found] == [True, True, True, False, False]

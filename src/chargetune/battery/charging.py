@@ -369,6 +369,15 @@ class ChargingProblem:
         reached = crossing_minutes(60 * time, np.concatenate([[self.soc_start], soc]), wanted)
         return -float(reached if reached is not None else 1.0 + wanted - soc[-1])
 
+    def charge_time(self, score: Score) -> tuple[str, float | None]:
+        """(its name, minutes) of the charging time that is the objective, else of that to 95 % SOC; None where it was not reached."""
+        mark = self.charge_time_to_soc or 0.95
+        name = f"t{100 * mark:.3g}"
+        if f"{name}_min" in score.metrics:
+            return name, score.metrics[f"{name}_min"]
+        share = -score.objective
+        return name, share * self.steps * self.sampling_time_s / 60 if share <= 1.0 else None
+
     def judged(self, limit: Limit) -> tuple[int, float]:
         """(intervals of the moving mean, excess still called kept): of a noisy signal what `NOISE_SD` sd of that mean may be."""
         noise = self.sensors.noise_sd.get(limit.signal, 0.0)

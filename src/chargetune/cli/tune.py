@@ -122,7 +122,8 @@ def _run(opening: Opening, problem: ChargingProblem, count: int, workers: int, *
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
             if incumbent is not None and incumbent.score is not None:
-                best = f"best t95 {number(incumbent.score.metrics.get('t95_min'))} min (trial {incumbent.number})"
+                name, minutes = problem.charge_time(incumbent.score)
+                best = f"best {name} {number(minutes)} min (trial {incumbent.number})"
             progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
 
         stack.enter_context(_said(progress.console))
