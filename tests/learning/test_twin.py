@@ -14,7 +14,9 @@ from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.lattice import Lattice
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
+from chargetune.learning.ask import Ask
 from chargetune.learning.belief import believe
+from chargetune.learning.twin_tuner import cautious
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -195,7 +197,7 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
         )
     tuner = TwinTuner(ChargingTwin(problem))
     belief = believe(tuner.loop, trials)
-    chances = [predicted.probability() for _, predicted in tuner._cautious(problem.space, belief, theta, 3)]
+    chances = [predicted.probability() for _, predicted in cautious(Ask(tuner.loop, problem.space, belief, trials, 3), theta)]
     assert belief.predict(theta, 64, 3).probability() < 0.5
     assert chances[0] > 0.8
     assert min(chances) >= 0.5
@@ -209,7 +211,7 @@ def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first
         score, episode, _ = problem(theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
     tuner = TwinTuner(ChargingTwin(problem))
-    found = tuner._cautious(problem.space, believe(tuner.loop, trials), theta, 3)
+    found = cautious(Ask(tuner.loop, problem.space, believe(tuner.loop, trials), trials, 3), theta)
     chances = [predicted.probability() for _, predicted in found]
     assert chances[0] < 0.5
     assert chances == sorted(chances, reverse=True)

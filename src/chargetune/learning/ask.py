@@ -1,0 +1,74 @@
+"""What one ask works with: the belief after these trials, and what it foretells of a theta."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.learning.belief import Belief, Prediction, TwinLoop, windows_of
+from chargetune.learning.corrected import Candidate, most_promising
+from chargetune.learning.envelope import covering
+from chargetune.learning.tuner import TrialLike
+from chargetune.learning.twin_search import AIMED as SEARCHED
+from chargetune.learning.twin_search import Search
+from chargetune.model.parameters import ParameterSpace
+
+__all__ = ["AIMED", "Ask"]
+
+# Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has foretold a trial:
+# its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
+DRAWS, DRAWS_UNPROVED = 32, 64
+# Of a limit's tolerance, what the upper side of the prediction may use.
+AIMED = 0.5
+# Iterations of the search that ends it.
+POLISHING = 8
+
+
+@dataclass(frozen=True)
+class Ask:
+    """One ask for thetas of ``space``, with what is believed of the plant after ``trials``; ``seed`` is of its draws."""
+
+    loop: TwinLoop
+    space: ParameterSpace
+    belief: Belief
+    trials: Sequence[TrialLike]
+    seed: int
+
+    def predicted(self, theta: NDArray[np.float64]) -> Prediction:
+        """What an ensemble of plants does with theta, the same plants for every theta."""
+        return self.belief.predict(theta, DRAWS if self.belief.proved else DRAWS_UNPROVED, self.seed)
+
+    def candidate(self, theta: NDArray[np.float64]) -> Candidate:
+        return theta, self.predicted(theta)
+
+    def covered(self, candidate: Candidate, deviations: float) -> NDArray[np.float64] | None:
+        """An envelope step by so many sd of the ensemble; None where there is nothing to step from."""
+        theta, predicted = candidate
+        expected, rows = self.belief.central(theta), predicted.upper_rows(deviations)
+        if expected is None or rows is None:
+            return None
+        return covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
+
+    def polished(self, candidate: Candidate, deviations: float) -> Candidate:
+        """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
+        theta, predicted = candidate
+        expected = self.belief.central(theta)
+        score = None if expected is None else self.loop.score(expected)
+        if score is None:
+            return candidate
+        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
+        search = Search(self.loop, self.belief.expected, self.space, np.nan_to_num(margin))
+        start = self.space.to_unit(theta)
+        search.scale([start, self.space.to_unit(self.space.default)])
+        search.refine(start, POLISHING)
+        return self.candidate(self.space.from_unit(search.best(start)))
+
+    def most_promising(self, candidates: Sequence[Candidate]) -> Candidate:
+        return most_promising(self.belief, self.space, self.trials, candidates, self.seed)
+
+    def moved(self, before: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+        """The largest change of an entry, as a share of its range."""
+        return float(np.max(np.abs(theta - before) / (self.space.upper - self.space.lower)))

@@ -1,0 +1,169 @@
+"""Safe mode: envelope steps on the upper side of the belief, and of what is safe enough the nearest that promises as much."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from chargetune.learning.ask import Ask
+from chargetune.learning.belief import episodes_of, windows_of
+from chargetune.learning.corrected import Candidate
+from chargetune.learning.envelope import covering
+from chargetune.learning.nearest import nearest
+from chargetune.learning.safety import NoSafeThetaError, Safety
+from chargetune.learning.twin_search import Search
+
+__all__ = ["SURE", "SafeAsk"]
+
+# How sure a safe belief is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
+# quantiles, the fewer there are the more is left to allow for.
+SURE = 0.84
+# Envelope steps on the plant that is expected.
+STEPS = 5
+# Envelope steps on the upper side of the prediction, which is that at the theta found last.
+ROUNDS = 7
+# A round that moves no entry by more than this share of its range was the last one.
+SETTLED = 2e-3
+# Beyond one limit's quantile, because several windows have to hold together.
+TOGETHER = 1.0
+# Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
+UNPROVED = 1.5
+# Factor on the deviations where they do not suffice.
+WIDER = 1.25
+# Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
+NEARINGS = 3
+# Shares of the way there: the longest that is safe is gone where none of these was.
+PARTS = (0.8, 0.5)
+
+
+@dataclass(frozen=True)
+class SafeAsk(Ask):
+    """An ask whose thetas keep every limit as ``safety`` states, as far as the belief tells."""
+
+    safety: Safety
+
+    def thetas(self) -> list[NDArray[np.float64]]:
+        """Every theta that is known to be safe enough for the next trial, each once, the most promising first.
+
+        Raises NoSafeThetaError where there is none, or the budget is spent.
+        """
+        if self.belief.discrepancy is None:
+            # Trials that left no trace have taught nothing.
+            return [self._start()]
+        self._check_budget()
+        passed, deviations = self._rounds()
+        if not passed:
+            return [self._tried()]
+        if self.belief.proved:
+            polished = self.polished(passed[0], deviations)
+            if self._safe(polished):
+                passed.insert(0, polished)
+        best = self.most_promising(passed)
+        # After a single trial the others are further ahead, and the prior has not yet been wrong.
+        others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
+        return [self._nearer(best, deviations), *others]
+
+    def _safe(self, candidate: Candidate) -> bool:
+        return candidate[1].probability() >= self.safety.probability
+
+    def _rounds(self) -> tuple[list[Candidate], float]:
+        """Thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
+        deviations = float(norm.ppf(self.safety.probability)) + (TOGETHER if self.belief.proved else TOGETHER + UNPROVED)
+        theta = self._expected_best()
+        passed: list[tuple[float, Candidate]] = []
+        for k in range(ROUNDS):
+            expected, candidate = self.belief.central(theta), self.candidate(theta)
+            score = None if expected is None else self.loop.score(expected)
+            if score is None:
+                break
+            following = self.covered(candidate, deviations)
+            if self._safe(candidate):
+                passed.append((score.objective, candidate))
+            elif k > 1:
+                deviations *= WIDER
+            if following is None:
+                break
+            # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
+            theta, before = following if k < 1 else (theta + following) / 2, theta
+            if passed and self.moved(before, theta) < SETTLED:
+                break
+        return [one for _, one in sorted(passed, key=lambda one: -one[0])], deviations
+
+    def _expected_best(self) -> NDArray[np.float64]:
+        """What the plant would allow if the belief were true: from there on caution only takes back."""
+        theta = np.array(self.trials[-1].theta)
+        for _ in range(STEPS):
+            episode = self.belief.central(theta)
+            if episode is None:
+                break
+            theta, before = covering(self.loop.controller, episode, theta, self.loop.measured_rows(episode)), theta
+            if self.moved(before, theta) < SETTLED:
+                break
+        return theta
+
+    def _nearer(self, candidate: Candidate, deviations: float) -> NDArray[np.float64]:
+        """Of the safe thetas that promise as much as this one the nearest to the best trial's, or one on the way to it."""
+        theta, predicted = candidate
+        search = Search(self.loop, self.belief.expected, self.space)
+        score, known = search.score(self.space.to_unit(theta)), self._kept()
+        if score is None or not known:
+            return theta
+        margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
+        allowed = np.nanmax(windows_of(score) + margin, initial=0.0) - margin
+        near = theta
+        for _ in range(NEARINGS):
+            near = nearest(search, self.space, known[0], near, score.objective, allowed)
+            there, expected = self.candidate(near), search.score(self.space.to_unit(near))
+            if self._safe(there):
+                return near
+            if expected is not None:
+                # It is less sure there, of some limits: those keep the margins of there.
+                allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)))
+        for share in PARTS:
+            part = theta + share * (near - theta)
+            if self._safe(self.candidate(part)):
+                return part
+        return theta
+
+    def _kept(self) -> list[NDArray[np.float64]]:
+        """The thetas that kept every limit as measured, the best first."""
+        known = [(t.score.objective, np.array(t.theta)) for t in self.trials if t.score is not None and t.score.feasible]
+        return [theta for _, theta in sorted(known, key=lambda one: -one[0])]
+
+    def _tried(self) -> NDArray[np.float64]:
+        """The best theta that was tried, kept the limits, and is still predicted to."""
+        for theta in self._kept():
+            if self._safe(self.candidate(theta)):
+                warnings.warn("no safe improvement is known: a theta that was tried is proposed again", RuntimeWarning, stacklevel=2)
+                return theta
+        what = f"no theta keeps every limit with probability {self.safety.probability:g}"
+        raise NoSafeThetaError(f"{what} as far as the {len(self.trials)} trials show; nothing was proposed")
+
+    def _check_budget(self) -> None:
+        if self.safety.budget is None:
+            return
+        spent = sum(self.loop.violation(e) for e in episodes_of(self.trials))
+        if spent > self.safety.budget:
+            raise NoSafeThetaError(f"the budget of violation is spent: {spent:.4g} of {self.safety.budget:g}; nothing was proposed")
+
+    def _start(self) -> NDArray[np.float64]:
+        """The declared start, or the corner with the least excess over plants of the prior, which has to be safe there."""
+        space, safety = self.space, self.safety
+        if safety.start is not None:
+            return space.validate(np.array(safety.start))
+        corners = [np.concatenate(parts) for parts in product(*([np.zeros(p.size), np.ones(p.size)] for p in space.parameters))]
+        predictions = [self.predicted(space.from_unit(u)) for u in corners]
+        chances = [p.probability() for p in predictions]
+        worst = [float(np.nanquantile(np.nanmax(p.excess, axis=1), safety.probability)) if len(p.excess) else np.inf for p in predictions]
+        at = min(range(len(corners)), key=lambda i: (-chances[i], worst[i]))
+        if chances[at] < safety.probability:
+            raise NoSafeThetaError(
+                f"no corner of theta keeps every limit with probability {safety.probability:g} on plants of the prior "
+                f"(the most cautious one: {chances[at]:.2f}); declare a start that does"
+            )
+        return space.from_unit(corners[at])
