@@ -157,6 +157,19 @@ def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_sa
         SafeAsk(loop, space, believe(loop, trials), trials, 0, Safety())._tried()
 
 
+def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_gone():
+    """After a charge with all nodes at 2.5, those at 1.4 are safe for sure and at 1.3 they are not at all."""
+    problem = charge(noise=0.0)
+    loop, theta = ChargingTwin(problem), np.full(9, 2.5)
+    score, episode, _ = problem(theta, 0)
+    trials = [told(0, theta, score, episode)]
+    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety())
+    aims = [ask.candidate(np.full(9, level)) for level in (1.6, 1.2, 1.0, 0.1)]
+    assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
+    found = [ask._furthest(theta, aim) for aim in aims]
+    assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, None]
+
+
 def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
     problem = charge(noise=0.0)
     trials = []

@@ -37,7 +37,7 @@ UNPROVED = 1.5
 WIDER = 1.25
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
 NEARINGS = 3
-# Shares of the way there: the longest that is safe is gone where none of these was.
+# Shares of the way to what is aimed at, which is not safe: the longest that is safe is gone.
 PARTS = (0.8, 0.5)
 
 
@@ -60,9 +60,8 @@ class SafeAsk(Ask):
         if not passed:
             return [self._tried()]
         if self.belief.proved:
-            polished = self.polished(passed[0], deviations)
-            if self._safe(polished):
-                passed.insert(0, polished)
+            ahead = self._furthest(passed[0][0], self.polished(passed[0], deviations))
+            passed = passed if ahead is None else [ahead, *passed]
         best = self.most_promising(passed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
         others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
@@ -124,11 +123,15 @@ class SafeAsk(Ask):
             if expected is not None:
                 # It is less sure there, of some limits: those keep the margins of there.
                 allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)))
-        for share in PARTS:
-            part = theta + share * (near - theta)
-            if self._safe(self.candidate(part)):
-                return part
-        return theta
+        part = self._furthest(theta, there)
+        return theta if part is None else part[0]
+
+    def _furthest(self, theta: NDArray[np.float64], aim: Candidate) -> Candidate | None:
+        """The aim where it is safe, else of the `PARTS` of the way there the longest that is; None where none is."""
+        if self._safe(aim):
+            return aim
+        parts = (self.candidate(theta + share * (aim[0] - theta)) for share in PARTS)
+        return next((part for part in parts if self._safe(part)), None)
 
     def _kept(self) -> list[NDArray[np.float64]]:
         """The thetas that kept every limit as measured, the best first."""
