@@ -148,13 +148,23 @@ def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_sa
     theta = np.full(9, 3.0)
     score, episode, _ = problem(theta, 0)
     loop, space = ChargingTwin(problem), problem.space
-    ask = SafeAsk(loop, space, believe(loop, trials := [told(0, theta, score, episode)]), trials, 0, Safety())
+    ask = SafeAsk(loop, space, believe(loop, trials := [told(0, theta, score, episode)]), trials, 0, Safety(), steps=5)
     with pytest.warns(RuntimeWarning, match="no safe improvement is known"):
         np.testing.assert_array_equal(ask._tried(), theta)
     unsafe, trace, _ = problem(problem.space.default, 0)
     trials = [told(0, problem.space.default, unsafe, trace)]
     with pytest.raises(NoSafeThetaError, match="nothing was proposed"):
-        SafeAsk(loop, space, believe(loop, trials), trials, 0, Safety())._tried()
+        SafeAsk(loop, space, believe(loop, trials), trials, 0, Safety(), steps=5)._tried()
+
+
+def test_a_trial_that_left_no_trace_does_not_have_the_start_judged_anew():
+    problem = charge(noise=0.0)
+    tuner = TwinTuner(ChargingTwin(problem), seed=3, safety=Safety(), steps=2)
+    lost = SimpleNamespace(number=0, theta=tuple(problem.space.upper), status="failed", score=None, episode=None)
+    asks = [tuner._safe_ask(problem.space, trials, tuner.safety) for trials in ([], [lost])]
+    assert [(ask.seed, ask.steps) for ask in asks] == [(3, 2), (3, 2)]
+    score, episode, _ = problem(problem.space.upper, 0)
+    assert tuner._safe_ask(problem.space, [told(0, problem.space.upper, score, episode)], tuner.safety).seed != 3
 
 
 def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_gone():
@@ -163,7 +173,7 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
     loop, theta = ChargingTwin(problem), np.full(9, 2.5)
     score, episode, _ = problem(theta, 0)
     trials = [told(0, theta, score, episode)]
-    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety())
+    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5)
     aims = [ask.candidate(np.full(9, level)) for level in (1.6, 1.2, 1.0, 0.1)]
     assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
     found = [ask._furthest(theta, aim) for aim in aims]

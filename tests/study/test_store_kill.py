@@ -21,5 +21,5 @@ def test_three_writers_killed_at_random(location):
     assert found["kills"] == KILLS + 3  # at the end the three that are left
     assert found["acknowledged"] >= 10
     assert found["told"] >= found["acknowledged"]
-    assert found["kills_with_a_running_trial"] >= 1  # the kills hit a study at work
+    assert found["kills_with_a_running_trial"] >= 2  # the kills hit a study at work
     assert found["begun_again"] <= found["kills"]

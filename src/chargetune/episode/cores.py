@@ -13,6 +13,7 @@ __all__ = ["each", "usable_cores"]
 
 Result = TypeVar("Result")
 
+# How the names of these threads begin, by which they are told from a user's.
 NAME = "chargetune-core"
 
 
@@ -24,7 +25,7 @@ def usable_cores() -> int:
 def each(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
     """``list(map(function, *arguments))``, in as many threads as there are cores; the first exception is raised.
 
-    Within such a thread it is what it says: the others are at work already.
+    Called from one of these threads it goes on in that thread: one that waited for the others could wait for ever.
     """
     if threading.current_thread().name.startswith(NAME):
         return list(map(function, *arguments))

@@ -23,8 +23,6 @@ __all__ = ["SURE", "SafeAsk"]
 # How sure a safe belief is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
 # quantiles, the fewer there are the more is left to allow for.
 SURE = 0.84
-# Envelope steps on the plant that is expected.
-STEPS = 5
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one.
@@ -37,15 +35,16 @@ UNPROVED = 1.5
 WIDER = 1.25
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
 NEARINGS = 3
-# Shares of the way to what is aimed at, which is not safe: the longest that is safe is gone.
+# Of the way to what is aimed at where that is not safe, the shares that are tried; the first that is safe is taken.
 PARTS = (0.8, 0.5)
 
 
 @dataclass(frozen=True)
 class SafeAsk(Ask):
-    """An ask whose thetas keep every limit as ``safety`` states, as far as the belief tells."""
+    """An ask whose thetas keep every limit as ``safety`` states, as far as the belief tells; begun by ``steps`` on the expected plant."""
 
     safety: Safety
+    steps: int
 
     def thetas(self) -> list[NDArray[np.float64]]:
         """Every theta that is known to be safe enough for the next trial, each once, the most promising first.
@@ -96,7 +95,7 @@ class SafeAsk(Ask):
     def _expected_best(self) -> NDArray[np.float64]:
         """What the plant would allow if the belief were true: from there on caution only takes back."""
         theta = np.array(self.trials[-1].theta)
-        for _ in range(STEPS):
+        for _ in range(self.steps):
             episode = self.belief.central(theta)
             if episode is None:
                 break

@@ -74,7 +74,7 @@ class TwinTuner:
             # A trial that is running has shown nothing yet, and what it tries need not be tried twice.
             running = [np.array(t.theta) for t in trials if t.status == "running"]
             done = [t for t in trials if t.status != "running"]
-            safe = SafeAsk(self.loop, space, believe(self.loop, done, SURE), done, self._seed(done), self.safety).thetas()
+            safe = self._safe_ask(space, done, self.safety).thetas()
             fresh = [theta for theta in safe if not any(np.array_equal(theta, other) for other in running)] or safe
             return np.array([fresh[i % len(fresh)] for i in range(n)])
         belief = believe(self.loop, trials) if trials else None
@@ -120,6 +120,12 @@ class TwinTuner:
             return min(predicted[k].probability(), 0.5), objective
 
         return max(predicted, key=rank, default=None)
+
+    def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
+        belief = believe(self.loop, trials, SURE)
+        # While nothing is known a start is judged by the same plants each time: other ones could pass by chance what these refused.
+        seed = self.seed if belief.discrepancy is None else self._seed(trials)
+        return SafeAsk(self.loop, space, belief, trials, seed, safety, self.steps)
 
     def _seed(self, trials: Sequence[TrialLike]) -> int:
         return self.seed + 7919 * len(trials)
