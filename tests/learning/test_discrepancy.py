@@ -161,6 +161,14 @@ def test_a_repeat_says_nothing_of_elsewhere():
 
 
 @pytest.mark.usefixtures("virtual_machine")
+def test_before_a_trial_was_foretold_errors_may_be_as_large_as_the_prior_of_the_scale_says():
+    problem = charge(steps=60)
+    trials = [told(problem.episode(np.full(9, 4.0), 1))]
+    scales = [believe(ChargingTwin(problem), trials, sure).discrepancy.scale for sure in (0.5, 0.84)]
+    np.testing.assert_allclose(scales, [1.0, np.exp(0.9945)], rtol=1e-4)
+
+
+@pytest.mark.usefixtures("virtual_machine")
 def test_features_are_one_to_three():
     belief, episodes = beliefs(charge(steps=60), (4.0,))
     with pytest.raises(ValueError, match="allowed are 1 to 3"):

@@ -52,8 +52,11 @@ class Ask:
             return None
         return covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
 
-    def polished(self, candidate: Candidate, deviations: float) -> Candidate:
-        """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held."""
+    def polished(self, candidate: Candidate, deviations: float, *, kept: bool = False) -> Candidate:
+        """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held.
+
+        They are held as far as the candidate holds them, or with ``kept`` as far as is found.
+        """
         theta, predicted = candidate
         expected = self.belief.central(theta)
         score = None if expected is None else self.loop.score(expected)
@@ -64,7 +67,7 @@ class Ask:
         start = self.space.to_unit(theta)
         search.scale([start, self.space.to_unit(self.space.default)])
         search.refine(start, POLISHING)
-        return self.candidate(self.space.from_unit(search.best(start)))
+        return self.candidate(self.space.from_unit(search.best(None if kept else start)))
 
     def most_promising(self, candidates: Sequence[Candidate]) -> Candidate:
         return most_promising(self.belief, self.space, self.trials, candidates, self.seed)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
@@ -194,7 +195,8 @@ def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5) -> B
     ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell.
     """
     episodes = tuple(episodes_of(trials, TRACES_MAX))
-    scale, mistake, guess = 1.0, 0.0, None
+    # Before a trial was foretold the scale is as its prior says, ln s ~ N(0, 1) (`Discrepancy.foretold`).
+    scale, mistake, guess = float(np.exp(norm.ppf(sure))), 0.0, None
     if len(episodes) > 1:
         # How well the newest trials were foretold by those before them is how far their successor can be trusted.
         known = max(1, len(episodes) - FORETOLD)

@@ -14,7 +14,7 @@ __all__ = ["nearest"]
 
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
-ITERATIONS = 10
+ITERATIONS = 20
 # From afar SLSQP may end beside what is allowed: then a part of that way may do.
 PARTS = (0.8, 0.6, 0.4, 0.2)
 # Windows further inside their limits than so many tolerances say nothing.

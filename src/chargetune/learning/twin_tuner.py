@@ -26,6 +26,8 @@ __all__ = ["TwinTuner", "cautious"]
 MISTAKEN = 3.5
 # Standard deviations that are taken back where nothing is promised; the acquisition chooses, none among them.
 CAUTION = (2.0, 3.0)
+# Of a trial that is the result, the probability of keeping every limit: a half, less two standard errors of an ensemble of 32.
+LIKELY = 0.32
 # Envelope steps that take them back.
 STEPS_BACK = 2
 # Two starts that are closer than this share of the range in every entry lead to one end.
@@ -112,14 +114,8 @@ class TwinTuner:
             if belief.discrepancy is None:
                 return None
             ask = Ask(self.loop, space, belief, trials, self._seed(trials))
-            predicted = {k: ask.predicted(np.array(t.theta)) for k, t in enumerate(trials) if t.score is not None}
-
-        def rank(k: int) -> tuple[float, float]:
-            scores = predicted[k].scores
-            objective = float(np.mean([s.objective for s in scores])) if scores else -np.inf
-            return min(predicted[k].probability(), 0.5), objective
-
-        return max(predicted, key=rank, default=None)
+            ranks = {k: _rank(ask.candidate(np.array(t.theta)), LIKELY) for k, t in enumerate(trials) if t.score is not None}
+        return max(ranks, key=lambda k: ranks[k], default=None)
 
     def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
         belief = believe(self.loop, trials, SURE)
@@ -158,10 +154,21 @@ def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
                 break
             at = ask.candidate(following)
             out.append(at)
-    ordered = [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1]]
-    likely = [one for one in ordered if one[1].probability() >= 0.5]
+    steps = [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1]]
+    # An envelope step knows nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
+    ahead = [ask.polished(start, CAUTION[0], kept=True), *(ask.polished(one, CAUTION[0]) for one in _likely(steps)[:1])]
+    likely = _likely([*sorted(ahead, key=lambda one: _rank(one, 0.5), reverse=True), *steps])
     # From a search that failed the steps lead to where the ensemble itself says that a limit breaks, and some limits they cannot
     # keep: then nothing is taken back, where that is likelier to keep them.
-    if not likely:
-        return sorted([*ordered, start], key=lambda one: -one[1].probability())
-    return [ask.polished(likely[0], CAUTION[0]), *likely]
+    return likely or sorted([*ahead, *steps, start], key=lambda one: -one[1].probability())
+
+
+def _likely(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Those that keep every limit at least as likely as not."""
+    return [one for one in candidates if one[1].probability() >= 0.5]
+
+
+def _rank(candidate: Candidate, likely: float) -> tuple[float, float]:
+    """First how likely it is to keep the limits, as far as that, then the objective expected of it."""
+    scores = candidate[1].scores
+    return min(candidate[1].probability(), likely), float(np.mean([s.objective for s in scores])) if scores else -np.inf
