@@ -21,6 +21,10 @@ PARTS = (0.8, 0.6, 0.4, 0.2)
 FAR = 1000.0
 # SLSQP ends a little on the wrong side: of a tolerance, and of the gain.
 ROUNDING = 0.1
+# SLSQP ends when distance and limits both are within one number of where they should be. In these units a rounding is that number;
+# in tolerances it went on for a thousandth of one, four times as long.
+CLOSE = 1e-5
+UNIT = CLOSE / ROUNDING
 
 
 def nearest(
@@ -57,7 +61,7 @@ def nearest(
         values = left(u)
         if float(np.min(values)) >= -ROUNDING:
             seen[np.clip(u, 0.0, 1.0).tobytes()] = float(np.sum((u - to) ** 2))
-        return values
+        return UNIT * values
 
     def slopes(u: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.where(u + STEP <= 1.0, STEP, -STEP)
@@ -65,7 +69,7 @@ def nearest(
         search.scores(around)
         values, beyond = left(u)[:, None], np.stack([left(ahead) for ahead in around], axis=1)
         # A window that is entered or left by a step has no slope.
-        return np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
+        return UNIT * np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
 
     end = minimize(
         lambda u: 0.5 * float(np.sum((u - to) ** 2)),
@@ -74,7 +78,7 @@ def nearest(
         method="SLSQP",
         bounds=[(0.0, 1.0)] * first.size,
         constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
-        options={"maxiter": ITERATIONS, "ftol": 1e-7},
+        options={"maxiter": ITERATIONS, "ftol": CLOSE},
     ).x
     for share in PARTS:
         constraint(first + share * (end - first))

@@ -30,7 +30,7 @@ SETTLED = 2e-3
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
-UNPROVED = 1.5
+UNPROVED = 1.25
 # Factor on the deviations where they do not suffice.
 WIDER = 1.25
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
@@ -55,12 +55,15 @@ class SafeAsk(Ask):
             # Trials that left no trace have taught nothing.
             return [self._start()]
         self._check_budget()
-        passed, deviations = self._rounds()
+        begin = self._expected_best()
+        passed, deviations = self._rounds(begin)
         if not passed:
             return [self._tried()]
         if self.belief.proved:
-            ahead = self._furthest(passed[0][0], self.polished(passed[0], deviations))
-            passed = passed if ahead is None else [ahead, *passed]
+            # The rounds know nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
+            aims = self.polished(passed[0], deviations), self.polished(self.candidate(begin), deviations, kept=True)
+            ahead = [self._furthest(passed[0][0], aim) for aim in aims]
+            passed = [*(one for one in ahead if one is not None), *passed]
         best = self.most_promising(passed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
         others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
@@ -69,10 +72,9 @@ class SafeAsk(Ask):
     def _safe(self, candidate: Candidate) -> bool:
         return candidate[1].probability() >= self.safety.probability
 
-    def _rounds(self) -> tuple[list[Candidate], float]:
-        """Thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
+    def _rounds(self, theta: NDArray[np.float64]) -> tuple[list[Candidate], float]:
+        """From theta on, thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
         deviations = float(norm.ppf(self.safety.probability)) + (TOGETHER if self.belief.proved else TOGETHER + UNPROVED)
-        theta = self._expected_best()
         passed: list[tuple[float, Candidate]] = []
         for k in range(ROUNDS):
             expected, candidate = self.belief.central(theta), self.candidate(theta)
