@@ -25,6 +25,8 @@ DRAWS, DRAWS_UNPROVED = 32, 64
 AIMED = 0.5
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
+# Of the objective, what another search would have to win.
+WORTH = 0.01
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,11 @@ class Ask:
         search.scale([start, self.space.to_unit(self.space.default)])
         search.refine(start, POLISHING)
         return self.candidate(self.space.from_unit(search.best(None if kept else start)))
+
+    def as_good(self, theta: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+        """Whether the objective expected of theta is that of another, less the share `WORTH` at most."""
+        mine, its = self.belief.scores([theta, other])
+        return mine is not None and its is not None and mine.objective >= its.objective - WORTH * abs(its.objective)
 
     def most_promising(self, candidates: Sequence[Candidate]) -> Candidate:
         return most_promising(self.belief, self.space, self.trials, candidates, self.seed)

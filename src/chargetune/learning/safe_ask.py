@@ -60,9 +60,11 @@ class SafeAsk(Ask):
         if not passed:
             return [self._tried()]
         if self.belief.proved:
-            # The rounds know nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
-            aims = self.polished(passed[0], deviations), self.polished(self.candidate(begin), deviations, kept=True)
-            ahead = [self._furthest(passed[0][0], aim) for aim in aims]
+            found = self._furthest(passed[0][0], self.polished(passed[0], deviations))
+            ahead = [found]
+            if found is None or not self.as_good(found[0], begin):
+                # The rounds know nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
+                ahead.append(self._furthest(passed[0][0], self.polished(self.candidate(begin), deviations, kept=True)))
             passed = [*(one for one in ahead if one is not None), *passed]
         best = self.most_promising(passed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.

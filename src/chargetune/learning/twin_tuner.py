@@ -156,7 +156,9 @@ def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
             out.append(at)
     steps = [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1]]
     # An envelope step knows nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
-    ahead = [ask.polished(start, CAUTION[0], kept=True), *(ask.polished(one, CAUTION[0]) for one in _likely(steps)[:1])]
+    ahead = [ask.polished(start, CAUTION[0], kept=True)]
+    if not (_likely(ahead) and ask.as_good(ahead[0][0], start[0])):
+        ahead += [ask.polished(one, CAUTION[0]) for one in _likely(steps)[:1]]
     likely = _likely([*sorted(ahead, key=lambda one: _rank(one, 0.5), reverse=True), *steps])
     # From a search that failed the steps lead to where the ensemble itself says that a limit breaks, and some limits they cannot
     # keep: then nothing is taken back, where that is likelier to keep them.
