@@ -117,6 +117,10 @@ def test_certify_and_verify(chargetune_here, store, tmp_path):
     best = json.loads(out)["studies"][0]["best"]
     assert list(told["theta"].values()) == best["theta"]
 
+    assert chargetune_here("certify", store, "--episodes", 1, "--trial", 0, "-o", tmp_path / "first.json")[0] == 0
+    first = json.loads((tmp_path / "first.json").read_text())
+    assert (first["origin"]["trial"], set(first["theta"].values())) == (0, {0.0})
+
     code, out, _ = chargetune_here("verify", target)
     assert code == 0
     assert "every figure is what the traces give" in out
@@ -137,6 +141,7 @@ def test_certify_and_verify(chargetune_here, store, tmp_path):
     ("arguments", "words"),
     [
         (("--study", "other"), "other"),
+        (("--trial", "6"), "--trial 6: study 'quick' has no such trial, allowed is 0 to 5"),
         (("--confidence", "1"), "--confidence = 1"),
         (("--resistance", "-1"), "resistance = -1"),
         (("-o", "c.txt"), "c.txt"),

@@ -238,6 +238,7 @@ def compare(
 def certify(
     store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of the study; needed when the store holds several.")] = None,
+    trial: Annotated[int | None, typer.Option(min=0, help="Its theta is run; else that of the best trial that kept every limit.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 0,
     confidence: Annotated[float, typer.Option(help="Confidence of the bound on the violation probability.")] = 0.95,
@@ -260,6 +261,7 @@ def certify(
     certify_command(
         store,
         study=study,
+        trial=trial,
         episodes=episodes,
         seed=seed,
         confidence=confidence,

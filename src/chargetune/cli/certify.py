@@ -26,6 +26,7 @@ def certify_command(
     location: str,
     *,
     study: str | None,
+    trial: int | None,
     episodes: int,
     seed: int,
     confidence: float,
@@ -34,7 +35,7 @@ def certify_command(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Run the best feasible theta of a study on fresh episodes and write the certificate."""
+    """Run the theta of a trial, or the best that kept every limit, on fresh episodes and write the certificate."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
     with Store(location, read_only=True) as store:
@@ -43,7 +44,10 @@ def certify_command(
             raise ValueError(f"{store.label} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
         record = store.study(study or names[0])
         trials = store.trials(record.id)
-    best = best_feasible(trials)
+    best = best_feasible(trials) if trial is None else next((t for t in trials if t.number == trial), None)
+    if best is None and trial is not None:
+        allowed = f"0 to {len(trials) - 1}" if trials else "none: it has no trials"
+        raise ValueError(f"--trial {trial}: study {record.name!r} has no such trial, allowed is {allowed}")
     if best is None:
         raise ValueError(f"{store.label}: study {record.name!r} has no trial that kept every limit, so there is nothing to certify")
     if "cell" not in record.identity["config"]:

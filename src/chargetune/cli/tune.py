@@ -26,7 +26,7 @@ from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
 from chargetune.study.store import Store
 from chargetune.study.study import Study
-from chargetune.study.trial import Trial, TrialStatus
+from chargetune.study.trial import Trial, TrialStatus, best_feasible
 
 __all__ = ["bar", "tune_command"]
 
@@ -69,8 +69,8 @@ def tune_command(
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
     _check(problem, config.safe_start(problem), force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
-    everything, safety = _run(opening, problem, count, workers, quiet=as_json)
-    best = tuned_trial(everything, config.study.tuner)
+    everything, believed, safety = _run(opening, problem, count, workers, quiet=as_json)
+    best = believed or tuned_trial(everything, config.study.tuner)
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
@@ -103,8 +103,10 @@ class Opening:
     accept_changed: bool
 
 
-def _run(opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool) -> tuple[list[Trial], dict[str, Any] | None]:
-    """The trials of the study, and what there is to say of safety."""
+def _run(
+    opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool
+) -> tuple[list[Trial], Trial | None, dict[str, Any] | None]:
+    """The trials of the study, the one that its tuner believes best, and what there is to say of safety."""
     config, kept = opening.config, opening.kept
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
@@ -141,7 +143,8 @@ def _run(opening: Opening, problem: ChargingProblem, count: int, workers: int, *
             stopped = str(error)
         everything = study.trials()[:count]
         safety = _safety(config, problem, study, everything, stopped)
-    return everything, safety
+        believed = study.believed_best(count)
+    return everything, believed, safety
 
 
 @contextmanager
@@ -202,6 +205,12 @@ def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | No
         screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
     if best is not None:
         units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
+        measured = best_feasible(everything)
+        if measured is not None and measured.number != best.number:
+            screen.print(
+                f"[dim]Trial {best.number} is the best one by all traces together, trial {measured.number} by its own noisy verdict. "
+                f"To certify the former: chargetune certify ... --trial {best.number}[/]"
+            )
         screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 

@@ -139,6 +139,20 @@ class Study:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
         return best_performance(self.trials())
 
+    def believed_best(self, count: int | None = None) -> Trial | None:
+        """Of the first ``count`` trials the one that the tuner believes best from all traces, None where it does not say.
+
+        One noisy verdict does not decide it (`TwinTuner.best`, `Composite.best`). But a trial that was measured to break a limit, by
+        more than its noise explains, is no result, and one of an earlier study is not this one's.
+        """
+        best = getattr(self.tuner, "best", None)
+        known = [t for t in self._traced(self.trials()[:count]) if t.status is not TrialStatus.RUNNING]
+        index = None if best is None else best(self.space, known)
+        if index is None or index < len(self.earlier):
+            return None
+        found = known[index]
+        return found if found.score is not None and found.score.feasible else None
+
     def trials_dataframe(self) -> Any:
         """All trials as a pandas data frame, see `trials_dataframe`. Raises ImportError without pandas."""
         return trials_dataframe(self.space, self.trials())
@@ -295,12 +309,15 @@ class Study:
         return self._record(len(trials), self._propose(trials, 1), trials, pending=pending)
 
     def _propose(self, trials: Sequence[Trial], n: int) -> list[tuple[float, ...]]:
-        known = [*self.earlier, *trials]
-        traced = [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in known]
-        thetas = np.asarray(self.tuner.ask(self.space, traced, n), dtype=float)
+        thetas = np.asarray(self.tuner.ask(self.space, self._traced(trials), n), dtype=float)
         if thetas.shape != (n, self.space.dimension):
             raise StudyError(f"the tuner proposed an array of shape {thetas.shape}, expected ({n}, {self.space.dimension})")
         return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
+
+    def _traced(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Earlier studies' trials and these, each with a reader of its episode where it has a trace."""
+        known = [*self.earlier, *trials]
+        return [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in known]
 
     def episode(self, number: int) -> Episode | None:
         """A trial's episode, None when none was stored or it is not an episode of this library."""
