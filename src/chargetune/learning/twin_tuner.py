@@ -41,10 +41,10 @@ class TwinTuner:
     Algorithm 1 with the twin's prediction of the score as the prior mean m(theta). Candidates begin where max objective s.t.
     excess <= tolerance, in every window where the score has a profile, is solved on the simulated closed loop with the twin at its
     posterior mode plus the mean discrepancy (`Search`), from theta_0, ``pool`` Sobol points and the thetas tried so far. They are
-    envelope steps from there, by several sd of an ensemble (`CAUTION`), and the first of them polished. Constrained log expected
-    improvement, on m corrected by the Gaussian process of what the trials left of it, picks one (`most_promising`). Further thetas of
-    a batch, and those proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same
-    thetas. Without a single trace the design is Sobol's.
+    what a search from there finds with several sd of an ensemble held back (`CAUTION`), and envelope steps by these. Constrained log
+    expected improvement, on m corrected by the Gaussian process of what the trials left of it, picks one (`most_promising`).
+    Further thetas of a batch, and those proposed beside running trials, are best on posterior draws. Deterministic: the same
+    trials give the same thetas. Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
@@ -105,9 +105,9 @@ class TwinTuner:
         return np.array([best, *thetas[1:]])
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
-        """Index of the trial that is believed best: the best objective expected of those that keep every limit more likely than not.
+        """Index of the trial that is believed best: the best objective expected of those that are not likely to break a limit (`LIKELY`).
 
-        No single measurement decides whether it kept them, all traces do; where none is likely to, the likeliest. None without traces.
+        No single measurement decides whether it kept them, all traces do; where all are likely to, the likeliest. None without traces.
         """
         with threadpool_limits(1):
             belief = believe(self.loop, trials)
@@ -144,7 +144,7 @@ class TwinTuner:
 
 
 def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
-    """From the best theta on the expected plant envelope steps that take back some sd; it too where none is likely to do."""
+    """From the best theta on the expected plant a search and steps that take back some sd; it too where none is likely to do."""
     start, out = ask.candidate(theta), []
     for deviations in CAUTION:
         at = start
