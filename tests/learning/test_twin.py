@@ -93,6 +93,14 @@ def test_draws_do_not_depend_on_how_many_cores_there_are(monkeypatch):
     np.testing.assert_array_equal(posterior.draw(6, 3), drawn)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("factor", [30.0, 100.0, 1e3, 1e4])
+def test_a_draw_from_which_outputs_are_not_finite_is_halved(factor):
+    problem = charge(ratios=(ResistanceRatio("R0"),))
+    posterior = ChargingTwin(problem).twin.fit([problem.episode(problem.space.default)])
+    assert np.all(np.isfinite(replace(posterior, root=factor * posterior.root).draw(8, 0)))
+
+
 def test_missing_samples_and_short_traces_are_taken_as_they_are():
     problem = charge()
     episode = problem.episode()

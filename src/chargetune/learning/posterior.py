@@ -67,10 +67,16 @@ class Posterior:
         for fresh in (False, True, True):
             m = self.mode + draw
             misfit, pull = self._misfit(m, draw)
+            if not np.isfinite(misfit):
+                draw = draw * 0.5
+                continue
             curvature, fallen = None, 1.0
             for _ in range(CHORDS):
                 if fresh and (curvature is None or fallen > KEPT):
-                    curvature = lu_factor(self._curvature(m))
+                    slopes = self._curvature(m)
+                    if not np.all(np.isfinite(slopes)):
+                        break
+                    curvature = lu_factor(slopes)
                 step = lu_solve(curvature, pull) if curvature is not None else self.root @ (self.root.T @ pull)
                 shares = (1.0, 0.5, 0.25) if fresh else (1.0,)
                 for share in shares:
@@ -103,9 +109,11 @@ class Posterior:
         pull = self._precision @ away
         total = float(away @ pull)
         for (u, seen), (values, slopes) in zip(self.seen, self._at_mode, strict=True):
-            left = np.where(seen, self.twin.predict(m, u) - values - slopes @ draw, 0.0) / self.spread
-            total += float(np.sum(left**2))
-            pull = pull + (left / self.spread).ravel() @ slopes.reshape(-1, draw.size)
+            # A long step may lead where outputs are not finite: their misfit is nan, which is smaller than none, and it is not taken.
+            with np.errstate(invalid="ignore", over="ignore"):
+                left = np.where(seen, self.twin.predict(m, u) - values - slopes @ draw, 0.0) / self.spread
+                total += float(np.sum(left**2))
+                pull = pull + (left / self.spread).ravel() @ slopes.reshape(-1, draw.size)
         return total, pull
 
     def _curvature(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -114,7 +122,8 @@ class Posterior:
         for (u, seen), (_, at_mode) in zip(self.seen, self._at_mode, strict=True):
             weight = np.where(seen, 1.0, 0.0) / self.spread**2
             own = self.twin.slopes(m, u).reshape(-1, m.size)
-            total += (at_mode.reshape(-1, m.size) * weight.reshape(-1, 1)).T @ own
+            with np.errstate(invalid="ignore", over="ignore"):
+                total += (at_mode.reshape(-1, m.size) * weight.reshape(-1, 1)).T @ own
         return total
 
     def predicted_sd(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
