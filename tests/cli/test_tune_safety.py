@@ -3,11 +3,16 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import run
 
+from chargetune.battery.cell import default_cell
+from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.config import load_config
 from chargetune.battery.reproduce import make_tuner
+from chargetune.cli.tune import _closing
+from chargetune.study.trial import Trial, TrialStatus
 
 STUDY = """
 [study]
@@ -101,3 +106,16 @@ def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
     problem = config.problem(tmp_path)
     with pytest.raises(ValueError, match=r"anode_min_V, which the cell's circuit does not predict"):
         make_tuner(config.study.tuner, 0, problem, config.safety)
+
+
+def test_where_all_traces_call_another_trial_best_than_its_verdict_does_tune_says_so(capsys):
+    problem = ChargingProblem(default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    thetas = [np.full(9, 2.5), np.full(9, 3.0)]
+    trials = [Trial(k, tuple(theta), status=TrialStatus.DONE, score=problem(theta, k)[0]) for k, theta in enumerate(thetas)]
+    _closing(problem, trials, trials[1])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Trial 1 is the best one by all traces together, trial 0 by its own noisy verdict." in said
+    assert "certify ... --trial 1" in said
+    assert "theta of trial 1:" in said
+    _closing(problem, trials, trials[0])
+    assert "by all traces" not in capsys.readouterr().out
