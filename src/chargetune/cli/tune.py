@@ -75,7 +75,7 @@ def tune_command(
     if out is not None:
         from chargetune.report import save_figures
 
-        figures = save_figures(kept, config.study.name, out, trials=count)
+        figures = save_figures(kept, config.study.name, out, trials=count, result=best.number if best else None)
     summary = _summary(config, everything, best, problem.space.entries)
     summary |= {"safety": safety} if safety else {}
     if out is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,8 @@ class StudyView:
     ``problem`` is None when the study is not one of battery charging.
 
     ``tuner`` is the tuner's name in the configuration, empty when that names none. ``record`` is what the store says of the
-    study as a whole, None only for trials that come from no store.
+    study as a whole, None only for trials that come from no store. ``result`` is the number of the trial that is the study's
+    result where its tuner named one, which the store does not know.
     """
 
     location: str
@@ -46,6 +47,7 @@ class StudyView:
     trials: tuple[Trial, ...]
     problem: ChargingProblem | None
     record: StudyRecord | None = None
+    result: int | None = None
 
     @property
     def untuned(self) -> Trial | None:
@@ -55,8 +57,9 @@ class StudyView:
 
     @property
     def tuned(self) -> Trial | None:
-        """The study's result, which `tuned_trial` decides; it need not have kept the limits. None when no trial has a score."""
-        return tuned_trial(self.trials, self.tuner)
+        """The study's result, the one named or what `tuned_trial` decides; it need not have kept the limits. None without a score."""
+        named = (t for t in self.trials if t.number == self.result)
+        return next(named, None) or tuned_trial(self.trials, self.tuner)
 
     @property
     def tuned_label(self) -> str:
@@ -108,18 +111,20 @@ class StudyView:
         return None if trial is None else next((episode for _, episode in self.episodes([trial])), None)
 
 
-def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
-    """Read a study, or its first ``trials`` trials, without writing to the store.
+def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None, result: int | None = None) -> StudyView:
+    """Read a study, or its first ``trials`` trials, without writing to the store; ``result`` names the trial that is its result.
 
     Raises StoreError for what is no store and for an unknown study, naming those that there are; ValueError for a study
-    without trials.
+    without trials, or without this one.
     """
     with Store(store, read_only=True) as opened:
         record = opened.study(name)
         found = opened.trials(record.id)[:trials]
     if not found:
         raise ValueError(f"{opened.label}: study {name!r} has no trials yet, so there is nothing to draw")
-    return _view(opened.location, record, found)
+    if result is not None and result not in {t.number for t in found}:
+        raise ValueError(f"{opened.label}: result = {result}, allowed is the number of a trial of study {name!r}, 0 to {len(found) - 1}")
+    return replace(_view(opened.location, record, found), result=result)
 
 
 def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
