@@ -32,6 +32,8 @@ DFN = {
     "dfn": (298.15, 10.0, False), "dfn-283K": (283.15, 10.0, False), "dfn-3C": (298.15, 15.0, False),
     "dfn-limits": (298.15, 10.0, True), "dfn-3C-limits": (298.15, 15.0, True),
 }  # fmt: skip
+# What the learner may exceed the voltage limit by, and what it is judged by.
+TOLERANCE_V = 1e-3
 PLANTS = ("ecm", "unknown", "structural", *DFN)
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_safe_charge.toml"
 
@@ -101,6 +103,7 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
         cell,
         mismatch_seed=seed,
         sensors=sensors,
+        tolerance_V=TOLERANCE_V,
         verdict_samples=5,
         charge_time_to_soc=0.95,
         **STUDIES[study],  # type: ignore[arg-type]
@@ -131,11 +134,11 @@ def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors, *
             "limit_backoffs": (LimitBackoff("temperature", -8.0, 8.0), LimitBackoff("anode", -0.05, 0.05, nodes=6)),
         }  # fmt: skip
     return ChargingProblem(
-        replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, verdict_samples=5,
-        charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **settings,
+        replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, tolerance_V=TOLERANCE_V,
+        verdict_samples=5, charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **settings,
     )  # fmt: skip
 
 
 def exact(problem: ChargingProblem) -> ChargingProblem:
-    """The same plant and controller, judged without noise, with the benchmark's tolerance of 1 mV."""
-    return replace(problem, sensors=Sensors(), verdict_samples=1, tolerance_V=1e-3)
+    """The same plant and controller, judged without noise."""
+    return replace(problem, sensors=Sensors(), verdict_samples=1)

@@ -61,15 +61,17 @@ def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
     assert minutes[-1] < 50.0
 
 
-def test_nothing_is_risked_for_nothing():
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_nothing_is_risked_for_nothing(seed):
     """The time to 60 % asks nothing of the backoff near full: there the charge stays as careful as it began."""
     start = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
-    problem = charge(ratios=(), backoff=start, charge_time_to_soc=0.6)
+    problem = charge(seed, ratios=(), backoff=start, charge_time_to_soc=0.6)
     trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 3)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
-    # Not all the way at 0.9: the curve through the nodes would bend down before it, where it is needed.
-    assert np.all(theta[9:] > (0.1, 0.2))
+    # Not all the way: the curve through the nodes would bend down before them, where it is needed. Without the search for the nearest
+    # theta they are near 0 or below.
+    assert np.all(theta[9:] > 0.1)
     assert np.all(theta[2:6] < 0.2)
     assert trials[-1].score.objective > trials[1].score.objective
 

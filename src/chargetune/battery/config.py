@@ -226,7 +226,8 @@ class SafetyTable(_Table):
 class TwinTable(_Table):
     """What is unknown of the plant before the first trial, as standard deviations: for the tuner "twin".
 
-    ``resistance_spread`` is that of the logarithm of every R and C, ``capacity_spread`` relative, 0 is known exactly.
+    ``resistance_spread`` is that of the logarithm of every R and C, ``capacity_spread`` relative, 0 is known exactly. ``ocv_spread_V`` is
+    that of a constant error of the OCV, which is taken as known but for it.
     """
 
     resistance_spread: float = Field(default=0.4, gt=0.0, le=2.0)

@@ -47,6 +47,7 @@ class ChargingTwin:
     ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
     nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
     ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
+    Where that error is stated the OCV is taken as known but for it.
     """
 
     problem: ChargingProblem
@@ -72,8 +73,8 @@ class ChargingTwin:
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
         error = {name: LEAST_ERROR[name] for name in names}
-        # Of the cell's own circuit the OCV is known. Of another plant it was identified, worst near full.
-        at_rest = OCV_SHARE if problem.plant_model else 0.0
+        # Of the cell's own circuit the OCV is known, and but for an unknown that is its error. Else it was identified, worst near full.
+        at_rest = OCV_SHARE if problem.plant_model and not self.ocv_spread_V else 0.0
         return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
 
     @cached_property

@@ -12,7 +12,6 @@ from chargetune.learning.belief import Belief, Prediction, TwinLoop, windows_of
 from chargetune.learning.corrected import Candidate, most_promising
 from chargetune.learning.envelope import covering
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin_search import AIMED as SEARCHED
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
@@ -21,8 +20,8 @@ __all__ = ["Ask"]
 # Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has foretold a trial:
 # its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
 DRAWS, DRAWS_UNPROVED = 32, 64
-# Of a limit's tolerance, what the upper side of the prediction may use.
-AIMED = 0.5
+# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step; a search has its own aim.
+AIMED = 0.8
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
 # Of the objective, what another search would have to win.
@@ -64,7 +63,7 @@ class Ask:
         score = None if expected is None else self.loop.score(expected)
         if score is None:
             return candidate
-        margin = predicted.upper_windows(deviations) - windows_of(score) + (SEARCHED - AIMED)
+        margin = predicted.upper_windows(deviations) - windows_of(score)
         search = Search(self.loop, self.belief.expected, self.space, np.nan_to_num(margin))
         start = self.space.to_unit(theta)
         search.scale([start, self.space.to_unit(self.space.default)])

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.learning.discrepancy import Discrepancy, OutputError
+from chargetune.learning.discrepancy import Discrepancy, Foretold, OutputError, scale_of
 from chargetune.learning.envelope import EnvelopeLoop
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.tuner import TrialLike
@@ -23,8 +23,6 @@ __all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop"
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
 TRACES_MAX = 4
-# By how many of them those before are judged: one may go where all is known already, and says nothing of the next.
-FORETOLD = 2
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
 """thetas -> the episode of each on one simulated plant, None where it fails."""
@@ -68,7 +66,7 @@ class TwinLoop(EnvelopeLoop, Protocol):
 class Belief:
     """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
 
-    ``mistake``: how wrong those before them were about the newest trials (`Discrepancy.foretold`); 0 before two are known.
+    ``mistake``: how wrong those before it were about the newest trial (`Discrepancy.foretold`); 0 before two are known.
     """
 
     loop: TwinLoop
@@ -104,6 +102,20 @@ class Belief:
     def predict(self, theta: NDArray[np.float64], count: int, seed: int) -> Prediction:
         """What ``count`` plants drawn from the belief do; the same plants for the same seed."""
         return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in self._plants(count, seed)])))
+
+    def replayed(self, episode: Episode, count: int, seed: int) -> NDArray[np.float64]:
+        """Measured outputs, without noise, of ``count`` drawn plants under the recorded inputs of an episode, shape (count, K, 2, outputs).
+
+        With noise added, what the next episode with these inputs should measure: a posterior predictive check.
+        """
+        twin, out = self.loop.twin, []
+        columns = [episode.output_names.index(name) for name in twin.noise_sd]
+        for m, error in self._plants(count, seed):
+            values = twin.predict(m, episode.input)
+            own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
+            own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
+            out.append(twin.measured(error(own) if error else own))
+        return np.array(out)
 
     @cached_property
     def _centre(self) -> tuple[NDArray[np.float64], OutputError | None]:
@@ -183,25 +195,34 @@ def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:
     return np.array(out)
 
 
-def episodes_of(trials: Sequence[TrialLike], newest: int | None = None) -> list[Episode]:
-    """The measured episodes of those trials that have one, of the ``newest`` of them only."""
+def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
+    """The measured episodes of those trials that have one."""
     readers = [reader for t in trials if (reader := getattr(t, "episode", None)) is not None]
-    return [e for reader in readers[-(newest or 0) :] if (e := reader()) is not None and len(e)]
+    return [e for reader in readers if (e := reader()) is not None and len(e)]
 
 
-def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5) -> Belief:
+def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5, unproved: float | None = None) -> Belief:
     """What the traces of these trials say; the prior when there is none.
 
-    ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell.
+    ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell: how well each was
+    foretold by those before it is how far their successor can be trusted. ``unproved``: the same before one was foretold, else ``sure``.
     """
-    episodes = tuple(episodes_of(trials, TRACES_MAX))
-    # Before a trial was foretold the scale is as its prior says, ln s ~ N(0, 1) (`Discrepancy.foretold`).
-    scale, mistake, guess = float(np.exp(norm.ppf(sure))), 0.0, None
-    if len(episodes) > 1:
-        # How well the newest trials were foretold by those before them is how far their successor can be trusted.
-        known = max(1, len(episodes) - FORETOLD)
-        before = loop.twin.fit(episodes[:known])
-        guess = before.mode
-        scale, mistake = Discrepancy(before, episodes[:known], loop.features).foretold(episodes[known:], sure)
-    posterior = loop.twin.fit(episodes, guess=guess)
-    return Belief(loop, posterior, Discrepancy(posterior, episodes, loop.features, scale) if episodes else None, mistake)
+    every = tuple(episodes_of(trials))
+    known = [_foretold(loop, every[max(0, k - TRACES_MAX) : k], every[k]) for k in range(1, len(every))]
+    scale = scale_of([foretold for foretold, _ in known], sure if known or unproved is None else unproved)
+    guess = known[-1][1] if known else None
+    newest = every[-TRACES_MAX:]
+    posterior = loop.twin.fit(newest, guess=guess)
+    discrepancy = Discrepancy(posterior, newest, loop.features, scale) if newest else None
+    return Belief(loop, posterior, discrepancy, known[-1][0].mistake if known else 0.0)
+
+
+def _foretold(loop: TwinLoop, before: tuple[Episode, ...], episode: Episode) -> tuple[Foretold, NDArray[np.float64]]:
+    """How well those before foretold an episode, and their mode. What was once judged stays so, and is remembered."""
+    remembered = loop.twin.foretold
+    content = [part for e in (*before, episode) for part in (e.input, e.output_start, e.output_end)]
+    key = hashlib.blake2b(b"".join(part.tobytes() for part in content)).digest()
+    if key not in remembered:
+        posterior = loop.twin.fit(before)
+        remembered[key] = Discrepancy(posterior, before, loop.features).foretold(episode), posterior.mode
+    return remembered[key]

@@ -24,11 +24,32 @@ from chargetune.episode.lattice import Lattice
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.twin import TOGETHER, blocks
 
-__all__ = ["Discrepancy", "OutputError"]
+__all__ = ["Discrepancy", "Foretold", "OutputError", "scale_of"]
 
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
+# Scales that are told apart.
+SCALES = np.geomspace(0.1, 10.0, 61)
+
+
+class Foretold(NamedTuple):
+    """What the prediction of one episode says."""
+
+    chance: NDArray[np.float64]
+    """Logarithm of the likelihood of each of `SCALES`."""
+    mistake: float
+    """Root mean square of what it was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none."""
+
+
+def scale_of(foretold: Sequence[Foretold], sure: float = 0.5) -> float:
+    """How many times larger than stated the discrepancy may be where nothing was measured, after these predictions.
+
+    The factor s on its standard deviation that is not exceeded with probability ``sure``, ln s ~ N(0, 1) before the first of them.
+    """
+    chance = -0.5 * np.log(SCALES) ** 2 + sum(one.chance for one in foretold)
+    known_to = np.cumsum(np.exp(chance - np.max(chance)))
+    return float(SCALES[np.searchsorted(known_to, sure * known_to[-1])])
 
 
 @dataclass(frozen=True)
@@ -72,28 +93,22 @@ class Discrepancy:
         each(lambda part: part.root, self._parts)
         return each(self.error, unknowns, seeds)
 
-    def foretold(self, episodes: Sequence[Episode], sure: float = 0.5) -> tuple[float, float]:
-        """(scale, mistake) of the prediction of episodes that were not learnt from, at their recorded inputs.
+    def foretold(self, episode: Episode) -> Foretold:
+        """How well an episode that was not learnt from was predicted, at its recorded inputs.
 
-        Scale: how many times larger than stated the discrepancy may be where nothing was measured. Mistake: root mean square of what
-        the prediction of the last one was off by, over noise, unknowns and ``Twin.error_sd``; several say that the twin is none.
-        The scale is the factor s on its standard deviation d that is not exceeded with probability ``sure``, given by how much r each
-        stretch of the episodes, at the recorded input, differs from its prediction: r ~ N(0, s^2 d^2 + v), v from noise and unknowns,
-        ln s ~ N(0, 1).
-        Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts by the share of its prior
-        variance that d^2 still is: what was measured before comes out as it was, however wrong the process is elsewhere.
+        Each stretch of the episode differs by r ~ N(0, s^2 d^2 + v) from its prediction: d the standard deviation of the discrepancy,
+        v from noise and unknowns, s the scale. Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts
+        by the share of its prior variance that d^2 still is: what was measured before comes out as it was, however wrong the process is
+        elsewhere.
         """
-        scales = np.geomspace(0.1, 10.0, 61)
-        chance, mistake = -0.5 * np.log(scales) ** 2, 0.0
+        off = self._off(episode)
+        known = off.known
+        if not known.any():
+            return Foretold(np.zeros_like(SCALES), 0.0)
+        variance = SCALES[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
+        chance = -0.5 * np.sum(off.novel[known] * (np.log(variance) + off.square[known] / variance), axis=1) / TOGETHER
         stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
-        for episode in episodes:
-            off = self._off(episode)
-            square, known = off.square[off.known], off.known
-            variance = scales[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
-            chance = chance - 0.5 * np.sum(off.novel[known] * (np.log(variance) + square / variance), axis=1) / TOGETHER
-            mistake = float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))) if known.any() else 0.0
-        known_to = np.cumsum(np.exp(chance - np.max(chance)))
-        return float(scales[np.searchsorted(known_to, sure * known_to[-1])]), mistake
+        return Foretold(chance, float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))))
 
     def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin

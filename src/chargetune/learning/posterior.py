@@ -29,7 +29,7 @@ class Posterior:
     """m ~ N(mode, root root') for the unknowns of ``twin``, and the standard deviation of what the model cannot represent, per output.
 
     ``spread`` is the standard deviation of a sample in the likelihood, ``seen`` the inputs of each episode and which of its
-    samples were measured.
+    samples were measured. ``sections``, where there are some, say more of its shape: Gaussians, each with its share of the draws.
     """
 
     twin: Twin
@@ -38,6 +38,7 @@ class Posterior:
     discrepancy_sd: NDArray[np.float64]
     spread: NDArray[np.float64]
     seen: tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...] = ()
+    sections: tuple[tuple[float, Posterior], ...] = ()
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -56,14 +57,28 @@ class Posterior:
         neither brings below `MISFIT` is halved towards the mode.
         """
         normal = np.random.default_rng(seed).standard_normal((count, self.root.shape[1]))
-        drawn = normal @ self.root.T
         if not self.seen:
-            return np.asarray(self.mode + drawn, dtype=np.float64)
-        # What all share is computed before they part.
-        _ = self._at_mode, self._precision
-        return np.array(each(self._moved, drawn))
+            return np.asarray(self.mode + normal @ self.root.T, dtype=np.float64)
+        parts = self._parts(count, seed)
+        # What all draws of one part share is computed before they part.
+        for part in {id(part): part for part in parts}.values():
+            part.prepare()
+        return np.array(each(Posterior.moved, parts, [part.root @ z for part, z in zip(parts, normal, strict=True)]))
 
-    def _moved(self, draw: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _parts(self, count: int, seed: int) -> list[Posterior]:
+        """Of which Gaussian each of so many draws is: of every section as many as its share is of all."""
+        if not self.sections:
+            return [self] * count
+        at = (np.random.default_rng([seed, 1]).permutation(count) + 0.5) / count
+        bounds = np.cumsum([share for share, _ in self.sections])
+        return [self.sections[k][1] for k in np.searchsorted(bounds[:-1], at)]
+
+    def prepare(self) -> None:
+        """What every draw needs, once."""
+        _ = self._at_mode, self._precision
+
+    def moved(self, draw: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The mode and a Gaussian draw of the difference from it -> the unknowns that predict what they should (`draw`)."""
         for fresh in (False, True, True):
             m = self.mode + draw
             misfit, pull = self._misfit(m, draw)

@@ -18,11 +18,12 @@ from chargetune.learning.nearest import nearest
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.twin_search import Search
 
-__all__ = ["SURE", "SafeAsk"]
+__all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
 
 # How sure a safe belief is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
-# quantiles, the fewer there are the more is left to allow for.
-SURE = 0.84
+# quantiles, the fewer there are the more is left to allow for. Before a trial was foretold: so that 90 % intervals of the second one
+# cover 90 % of it, on plants that the twin can be and on such as it cannot.
+SURE, SURE_UNPROVED = 0.84, 0.93
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one.
@@ -30,7 +31,7 @@ SETTLED = 2e-3
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
-UNPROVED = 1.25
+UNPROVED = 1.0
 # Factor on the deviations where they do not suffice.
 WIDER = 1.25
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.

@@ -2,7 +2,8 @@
 
 Model: y = h(x, u, p) + bias + discrepancy, x+ = f(x, u, p), p = nominal * exp(m) for factors and nominal + m for offsets, with
 prior m ~ N(0, S). Every measured output at both ends of every interval of every trial is a datum. The posterior is Laplace's: mode by
-Gauss-Newton with exact sensitivities from CasADi, covariance (J'J)^-1 of the whitened residuals at the mode.
+Gauss-Newton with exact sensitivities from CasADi, covariance (J'J)^-1 of the whitened residuals at the mode; where that is not its shape
+along an unknown that is one number, a sum of such Gaussians (`sections`).
 Source: MacKay, Neural Computation 4 (1992) 448; Bock, in Modelling of Chemical Reaction Systems (1981) for the least squares.
 """
 
@@ -13,7 +14,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -24,7 +25,11 @@ from chargetune.control.compiler import compile_library, find_compiler
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.learning.posterior import Posterior
+from chargetune.learning.sections import sections
 from chargetune.model.model import Model
+
+if TYPE_CHECKING:
+    from chargetune.learning.discrepancy import Foretold
 
 __all__ = ["BLOCKS", "Twin", "Uncertain", "blocks"]
 
@@ -112,6 +117,16 @@ class Twin:
         return tuple(1 if one.kind in ("start", "bias") else self.model.parameter_blocks[one.name] for one in self.unknowns)
 
     @cached_property
+    def foretold(self) -> dict[bytes, tuple[Foretold, NDArray[np.float64]]]:
+        """How well episodes were foretold, and the modes by which, as far as it is known (`belief.believe`)."""
+        return {}
+
+    @property
+    def scalars(self) -> list[int]:
+        """Entries of the unknowns that are one number: the prior knows each apart from all others."""
+        return [int(at) for at, size in zip(np.cumsum([0, *self.sizes[:-1]]), self.sizes, strict=True) if size == 1]
+
+    @cached_property
     def prior_factor(self) -> NDArray[np.float64]:
         """Lower Cholesky factor of the prior covariance S, shape (d, d)."""
         out = np.zeros((sum(self.sizes), sum(self.sizes)))
@@ -192,7 +207,10 @@ class Twin:
         # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.
         curvature, directions = np.linalg.eigh(cost_jacobian.T @ cost_jacobian)
         root = factor @ (directions / np.sqrt(curvature))
-        return Posterior(self, factor @ e, root, unmodelled, spread, tuple((u, np.isfinite(y)) for u, y in data))
+        seen = tuple((u, np.isfinite(y)) for u, y in data)
+        parts = sections(misfit, np.asarray(e, np.float64), np.asarray(directions / np.sqrt(curvature)), self.scalars) if data else []
+        apart = tuple((one.share, Posterior(self, factor @ one.mode, factor @ one.root, unmodelled, spread, seen)) for one in parts)
+        return Posterior(self, factor @ e, root, unmodelled, spread, seen, apart)
 
 
 class _Misfit:

@@ -14,7 +14,7 @@ from chargetune.learning.ask import Ask
 from chargetune.learning.belief import TwinLoop, believe
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.corrected import Candidate
-from chargetune.learning.safe_ask import SURE, SafeAsk
+from chargetune.learning.safe_ask import SURE, SURE_UNPROVED, SafeAsk
 from chargetune.learning.safety import Safety
 from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
 from chargetune.learning.twin_search import Search
@@ -118,7 +118,7 @@ class TwinTuner:
         return max(ranks, key=lambda k: ranks[k], default=None)
 
     def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
-        belief = believe(self.loop, trials, SURE)
+        belief = believe(self.loop, trials, SURE, SURE_UNPROVED)
         # While nothing is known a start is judged by the same plants each time: other ones could pass by chance what these refused.
         seed = self.seed if belief.discrepancy is None else self._seed(trials)
         return SafeAsk(self.loop, space, belief, trials, seed, safety, self.steps)
