@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,14 @@ from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
-__all__ = ["Ask"]
+__all__ = ["WORTH", "Ask"]
 
 # Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has foretold a trial:
 # its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
 DRAWS, DRAWS_UNPROVED = 32, 64
-# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step; a search has its own aim.
-AIMED = 0.8
+# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step; a search has its own aim. The few standard
+# deviations that are taken back without a promise are no promise.
+AIMED = 0.25
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
 # Of the objective, what another search would have to win.
@@ -37,6 +39,7 @@ class Ask:
     belief: Belief
     trials: Sequence[TrialLike]
     seed: int
+    aimed: ClassVar[float] = AIMED
 
     def predicted(self, theta: NDArray[np.float64]) -> Prediction:
         """What an ensemble of plants does with theta, the same plants for every theta."""
@@ -51,7 +54,7 @@ class Ask:
         expected, rows = self.belief.central(theta), predicted.upper_rows(deviations)
         if expected is None or rows is None:
             return None
-        return covering(self.loop.controller, expected, theta, rows - AIMED * self.loop.row_tolerances)
+        return covering(self.loop.controller, expected, theta, rows - self.aimed * self.loop.row_tolerances)
 
     def polished(self, candidate: Candidate, deviations: float, *, kept: bool = False) -> Candidate:
         """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ __all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
 # quantiles, the fewer there are the more is left to allow for. Before a trial was foretold: so that 90 % intervals of the second one
 # cover 90 % of it, on plants that the twin can be and on such as it cannot.
 SURE, SURE_UNPROVED = 0.84, 0.93
+# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step.
+AIMED = 0.8
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one.
@@ -46,6 +49,7 @@ class SafeAsk(Ask):
 
     safety: Safety
     steps: int
+    aimed: ClassVar[float] = AIMED
 
     def thetas(self) -> list[NDArray[np.float64]]:
         """Every theta that is known to be safe enough for the next trial, each once, the most promising first.

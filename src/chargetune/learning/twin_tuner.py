@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from chargetune.learning.ask import Ask
+from chargetune.learning.ask import WORTH, Ask
 from chargetune.learning.belief import TwinLoop, believe
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.corrected import Candidate
@@ -105,17 +105,24 @@ class TwinTuner:
         return np.array([best, *thetas[1:]])
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
-        """Index of the trial that is believed best: the best objective expected of those that are not likely to break a limit (`LIKELY`).
+        """Index of the trial that is believed best; None without traces.
 
-        No single measurement decides whether it kept them, all traces do; where all are likely to, the likeliest. None without traces.
+        Of those that are not likely to break a limit (`LIKELY`) and whose objective is expected within the share `WORTH` of the best of
+        these, the likeliest to keep all; where each is likely to break one, the likeliest. No single measurement decides whether a trial
+        kept them, all traces do.
         """
         with threadpool_limits(1):
             belief = believe(self.loop, trials)
             if belief.discrepancy is None:
                 return None
             ask = Ask(self.loop, space, belief, trials, self._seed(trials))
-            ranks = {k: _rank(ask.candidate(np.array(t.theta)), LIKELY) for k, t in enumerate(trials) if t.score is not None}
-        return max(ranks, key=lambda k: ranks[k], default=None)
+            known = {k: ask.candidate(np.array(t.theta)) for k, t in enumerate(trials) if t.score is not None}
+            ahead = max(known, key=lambda k: _rank(known[k], LIKELY), default=None)
+            if ahead is None:
+                return None
+            chance, objective = _rank(known[ahead], LIKELY)
+            equal = [k for k, one in known.items() if _rank(one, LIKELY) >= (chance, objective - WORTH * abs(objective))]
+            return max(equal, key=lambda k: _rank(known[k], 1.0))
 
     def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
         belief = believe(self.loop, trials, SURE, SURE_UNPROVED)
