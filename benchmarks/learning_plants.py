@@ -32,7 +32,7 @@ DFN = {
     "dfn": (298.15, 10.0, False), "dfn-283K": (283.15, 10.0, False), "dfn-3C": (298.15, 15.0, False),
     "dfn-limits": (298.15, 10.0, True), "dfn-3C-limits": (298.15, 15.0, True),
 }  # fmt: skip
-# What the learner may exceed the voltage limit by, and what it is judged by.
+# What the voltage limit may be exceeded by.
 TOLERANCE_V = 1e-3
 PLANTS = ("ecm", "unknown", "structural", *DFN)
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "dfn_safe_charge.toml"
