@@ -5,7 +5,7 @@
 A row is one method after one number of trials. Solved: the true, noise-free excess of the theta that the learner recommends
 is at most 1 mV, any other limit kept within its tolerance, and its t95 within 1.05 of the attainable one. Recommended is the
 best that is believed to keep the limits by twin and composite (their `best`), the newest theta by safe and ilc, the best
-that kept the limits as measured by the others. Twin and safe are told this tolerance, the others half of it.
+that kept the limits as measured by the others. Safe is told this tolerance, the others half of it.
 Attainable: the least t95 with at most 1 mV over the limit that envelope steps and SLSQP on the true plant find, computed here and
 kept in --cache; on a DFN plant envelope steps alone, and t80 stands for t95 in every key. Where no theta keeps the limit, nothing
 is solved. A safe learner that knows no safe theta stops. ask_s is wall time, for which --workers 1 leaves both cores to the learner.
@@ -42,8 +42,8 @@ from chargetune.learning.twin_search import Search
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0
 NEWEST, BELIEVED = ("safe", "ilc"), ("twin", "composite")
-# A twin knows how sure it is of the voltage and is told the tolerance that it is judged by; who has measured excesses alone is told half.
-TWINS, SHARE_TOLD = ("safe", "twin"), 0.5
+# Who promises to keep a limit is told the tolerance that it is judged by, the others half of it.
+PROMISING, SHARE_TOLD = ("safe",), 0.5
 
 
 def _safe(problem: Any, seed: int) -> Any:
@@ -113,7 +113,7 @@ def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int
     method, seed = job
     problem = make_problem(plant, study, seed, noise_V)
     truth = exact(problem)
-    if method not in TWINS:
+    if method not in PROMISING:
         problem = replace(problem, tolerance_V=SHARE_TOLD * problem.tolerance_V)
     tuner = METHODS[method](problem, seed)
     told: list[Any] = []

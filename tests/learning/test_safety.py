@@ -231,15 +231,15 @@ def test_nonsense_is_refused_by_name(make, said):
 
 
 def test_of_trials_as_good_the_likeliest_to_keep_the_limit_is_the_result():
-    """One at 0.3 mV of the 0.5 allowed, one half a percent slower and well below, one that is two percent slower."""
+    """One at 0.3 mV of the 0.5 allowed, one 0.15 percent slower at 0, one that is half a percent slower."""
     problem = charge(charge_time_to_soc=0.95)
     tuner, trials = TwinTuner(ChargingTwin(problem)), []
-    for number, level in enumerate((4.0, 1.368, 1.376, 1.42)):
+    for number, level in enumerate((4.0, 1.368, 1.371, 1.376)):
         score, episode, _ = problem(np.full(9, level), number)
         trials.append(told(number, np.full(9, level), score, episode))
     ask = Ask(tuner.loop, problem.space, believe(tuner.loop, trials), trials, 0)
     chances = [ask.candidate(np.array(t.theta))[1].probability() for t in trials]
     objectives = [score.objective for score in ask.belief.scores([np.array(t.theta) for t in trials])]
     assert 0.35 < chances[1] < 0.95 < min(chances[0], *chances[2:])
-    assert objectives[3] < 1.01 * objectives[1] < objectives[2] < objectives[1]
+    assert objectives[3] < 1.002 * objectives[1] < objectives[2] < objectives[1]
     assert tuner.best(problem.space, trials) == 2

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from chargetune.learning.ask import WORTH, Ask
+from chargetune.learning.ask import Ask
 from chargetune.learning.belief import TwinLoop, believe
 from chargetune.learning.constrained import ConstrainedLogEI
 from chargetune.learning.corrected import Candidate
@@ -28,6 +28,8 @@ MISTAKEN = 3.5
 CAUTION = (2.0, 3.0)
 # Of a trial that is the result, the probability of keeping every limit: a half, less two standard errors of an ensemble of 32.
 LIKELY = 0.32
+# Of the objective, a difference that is worth no risk.
+ALIKE = 0.002
 # Envelope steps that take them back.
 STEPS_BACK = 2
 # Two starts that are closer than this share of the range in every entry lead to one end.
@@ -107,7 +109,7 @@ class TwinTuner:
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
         """Index of the trial that is believed best; None without traces.
 
-        Of those that are not likely to break a limit (`LIKELY`) and whose objective is expected within the share `WORTH` of the best of
+        Of those that are not likely to break a limit (`LIKELY`) and whose objective is expected within the share `ALIKE` of the best of
         these, the likeliest to keep all; where each is likely to break one, the likeliest. No single measurement decides whether a trial
         kept them, all traces do.
         """
@@ -121,7 +123,7 @@ class TwinTuner:
             if ahead is None:
                 return None
             chance, objective = _rank(known[ahead], LIKELY)
-            equal = [k for k, one in known.items() if _rank(one, LIKELY) >= (chance, objective - WORTH * abs(objective))]
+            equal = [k for k, one in known.items() if _rank(one, LIKELY) >= (chance, objective - ALIKE * abs(objective))]
             return max(equal, key=lambda k: _rank(known[k], 1.0))
 
     def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
