@@ -31,7 +31,8 @@ TRIALS, PLANTS_DRAWN, NOISE_V, STATED = 3, 96, 2e-3, 0.9
 
 def share(belief: Belief, episode: Episode, seed: int) -> float:
     """Of the noisy samples of the voltage, the share within the stated intervals."""
-    drawn = belief.replayed(episode, PLANTS_DRAWN, seed)[..., 0]
+    replayed = belief.replayed(episode, PLANTS_DRAWN, seed).episodes
+    drawn = np.array([np.stack(e.signal("voltage_V"), axis=1) for e in replayed if e is not None])
     drawn = drawn + NOISE_V * np.random.default_rng(seed).standard_normal(drawn.shape)
     low, high = np.quantile(drawn, [(1 - STATED) / 2, (1 + STATED) / 2], axis=0)
     measured = np.stack(episode.signal("voltage_V"), axis=1)

@@ -47,7 +47,8 @@ def gap(episode, name, where):
 
 def drawn_voltages(belief, episode, count=48):
     """Voltages at the recorded input of an episode on drawn plants, shape (count, K, 2)."""
-    return belief.replayed(episode, count, 3)[..., 0]
+    replayed = belief.replayed(episode, count, 3).episodes
+    return np.array([np.stack(e.signal("voltage_V"), axis=1) for e in replayed])
 
 
 @pytest.mark.parametrize("pairs", [False, True], ids=["a circuit", "a plant that the twin cannot be"])

@@ -45,6 +45,13 @@ class Ask:
         """What an ensemble of plants does with theta, the same plants for every theta."""
         return self.belief.predict(theta, DRAWS if self.belief.proved else DRAWS_UNPROVED, self.seed)
 
+    def tried(self, trial: TrialLike) -> Candidate:
+        """The theta of a trial with what an ensemble of plants does under the inputs of that trial, where they were recorded."""
+        reader = getattr(trial, "episode", None)
+        episode = None if reader is None else reader()
+        theta = np.array(trial.theta)
+        return self.candidate(theta) if episode is None else (theta, self.belief.replayed(episode, DRAWS, self.seed))
+
     def candidate(self, theta: NDArray[np.float64]) -> Candidate:
         return theta, self.predicted(theta)
 

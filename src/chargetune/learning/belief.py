@@ -103,10 +103,11 @@ class Belief:
         """What ``count`` plants drawn from the belief do; the same plants for the same seed."""
         return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in self._plants(count, seed)])))
 
-    def replayed(self, episode: Episode, count: int, seed: int) -> NDArray[np.float64]:
-        """Measured outputs, without noise, of ``count`` drawn plants under the recorded inputs of an episode, shape (count, K, 2, outputs).
+    def replayed(self, episode: Episode, count: int, seed: int) -> Prediction:
+        """What ``count`` drawn plants do under the recorded inputs of an episode, without noise.
 
-        With noise added, what the next episode with these inputs should measure: a posterior predictive check.
+        Of an episode that was learnt from it is what truly happened there, closer than `predict` has it: no controller acts differently
+        on each plant. With noise added it is what the next episode with these inputs should measure: a posterior predictive check.
         """
         twin, out = self.loop.twin, []
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
@@ -114,8 +115,8 @@ class Belief:
             values = twin.predict(m, episode.input)
             own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
             own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
-            out.append(twin.measured(error(own) if error else own))
-        return np.array(out)
+            out.append(error(own) if error else own)
+        return Prediction(self.loop, tuple(out))
 
     @cached_property
     def _centre(self) -> tuple[NDArray[np.float64], OutputError | None]:

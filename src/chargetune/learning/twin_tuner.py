@@ -28,8 +28,8 @@ MISTAKEN = 3.5
 CAUTION = (2.0, 3.0)
 # Of a trial that is the result, the probability of keeping every limit: a half, less two standard errors of an ensemble of 32.
 LIKELY = 0.32
-# Of the objective, a difference that is worth no risk.
-ALIKE = 0.002
+# Of the objective, what no standard deviation is worth: so much worse a theta is kept, and of no use.
+USELESS = 0.1
 # Envelope steps that take them back.
 STEPS_BACK = 2
 # Two starts that are closer than this share of the range in every entry lead to one end.
@@ -109,22 +109,17 @@ class TwinTuner:
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
         """Index of the trial that is believed best; None without traces.
 
-        Of those that are not likely to break a limit (`LIKELY`) and whose objective is expected within the share `ALIKE` of the best of
-        these, the likeliest to keep all; where each is likely to break one, the likeliest. No single measurement decides whether a trial
-        kept them, all traces do.
+        Of those that are not likely to have broken a limit (`LIKELY`) the one of the best objective; where each is likely to, the
+        likeliest to have kept all. No single measurement decides whether a trial kept them: all traces do, by what they say of the
+        plant under the inputs of that trial.
         """
         with threadpool_limits(1):
             belief = believe(self.loop, trials)
             if belief.discrepancy is None:
                 return None
             ask = Ask(self.loop, space, belief, trials, self._seed(trials))
-            known = {k: ask.candidate(np.array(t.theta)) for k, t in enumerate(trials) if t.score is not None}
-            ahead = max(known, key=lambda k: _rank(known[k], LIKELY), default=None)
-            if ahead is None:
-                return None
-            chance, objective = _rank(known[ahead], LIKELY)
-            equal = [k for k, one in known.items() if _rank(one, LIKELY) >= (chance, objective - ALIKE * abs(objective))]
-            return max(equal, key=lambda k: _rank(known[k], 1.0))
+            known = {k: ask.tried(t) for k, t in enumerate(trials) if t.score is not None}
+            return max(known, key=lambda k: _rank(known[k], LIKELY), default=None)
 
     def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
         belief = believe(self.loop, trials, SURE, SURE_UNPROVED)
@@ -168,7 +163,7 @@ def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
     ahead = [ask.polished(start, CAUTION[0], kept=True)]
     if not (_likely(ahead) and ask.as_good(ahead[0][0], start[0])):
         ahead += [ask.polished(one, CAUTION[0]) for one in _likely(steps)[:1]]
-    likely = _likely([*sorted(ahead, key=lambda one: _rank(one, 0.5), reverse=True), *steps])
+    likely = _useful(_likely([*sorted(ahead, key=lambda one: _rank(one, 0.5), reverse=True), *steps]))
     # From a search that failed the steps lead to where the ensemble itself says that a limit breaks, and some limits they cannot
     # keep: then nothing is taken back, where that is likelier to keep them.
     return likely or sorted([*ahead, *steps, start], key=lambda one: -one[1].probability())
@@ -177,6 +172,13 @@ def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
 def _likely(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Those that keep every limit at least as likely as not."""
     return [one for one in candidates if one[1].probability() >= 0.5]
+
+
+def _useful(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Those whose expected objective is at most the share `USELESS` worse than the best of them."""
+    objectives = [_rank(one, 0.0)[1] for one in candidates]
+    least = max(objectives, default=0.0)
+    return [one for one, objective in zip(candidates, objectives, strict=True) if objective >= least - USELESS * abs(least)]
 
 
 def _rank(candidate: Candidate, likely: float) -> tuple[float, float]:
