@@ -13,7 +13,7 @@ from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning.belief import believe
-from chargetune.learning.discrepancy import Discrepancy, scale_of
+from chargetune.learning.discrepancy import Discrepancy, _Part, scale_of
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -164,6 +164,13 @@ def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
     assert scales[1] > 0.7 * scales[0]
 
 
+def test_a_factor_of_a_covariance_that_rounding_left_indefinite():
+    """What the data take away is a little more than there is: of 2 by 2, the eigenvalues 2 and -1e-6."""
+    taken = np.array([[1e-6, 0.0], [0.0, 1e-6]])
+    root = _Part(taken, np.ones((2, 2)), np.eye(2)).root
+    np.testing.assert_allclose(root @ root.T, np.ones((2, 2)), atol=2e-6)
+
+
 @pytest.mark.usefixtures("virtual_machine")
 def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
     problem = charge(steps=60)
@@ -174,6 +181,8 @@ def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
         belief = believe(loop, trials[:n])
         fits.append(len(loop.twin.foretold))
     assert fits == [1, 2, 2]
+    assert len(loop.twin.modes) == 3
+    assert len(loop.twin.newest) == 1
     fresh = believe(ChargingTwin(problem), trials)
     assert fresh.discrepancy.scale == belief.discrepancy.scale
     assert fresh.mistake == belief.mistake

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.learning.discrepancy import Discrepancy, Foretold, OutputError, scale_of
+from chargetune.learning.discrepancy import Discrepancy, OutputError, scale_of
 from chargetune.learning.envelope import EnvelopeLoop
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.tuner import TrialLike
@@ -81,7 +81,9 @@ class Belief:
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
-        return self.expected([theta])[0]
+        if theta.tobytes() not in self._expected:
+            (self._expected[theta.tobytes()],) = self.expected([theta])
+        return self._expected[theta.tobytes()]
 
     def expected(self, thetas: Sequence[NDArray[np.float64]]) -> list[Episode | None]:
         """`central` of several thetas."""
@@ -130,6 +132,10 @@ class Belief:
             errors = self.discrepancy.errors(draws, seeds) if self.discrepancy else [None] * count
             self._drawn[count, seed] = list(zip(draws, errors, strict=True))
         return self._drawn[count, seed]
+
+    @cached_property
+    def _expected(self) -> dict[bytes, Episode | None]:
+        return {}
 
     @cached_property
     def _scored(self) -> dict[bytes, Score | None]:
@@ -208,22 +214,36 @@ def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5, unpr
     ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell: how well each was
     foretold by those before it is how far their successor can be trusted. ``unproved``: the same before one was foretold, else ``sure``.
     """
-    every = tuple(episodes_of(trials))
-    known = [_foretold(loop, every[max(0, k - TRACES_MAX) : k], every[k]) for k in range(1, len(every))]
-    scale = scale_of([foretold for foretold, _ in known], sure if known or unproved is None else unproved)
-    guess = known[-1][1] if known else None
-    newest = every[-TRACES_MAX:]
-    posterior = loop.twin.fit(newest, guess=guess)
-    discrepancy = Discrepancy(posterior, newest, loop.features, scale) if newest else None
-    return Belief(loop, posterior, discrepancy, known[-1][0].mistake if known else 0.0)
+    twin, every = loop.twin, episodes_of(trials)
+    if not every:
+        return Belief(loop, twin.fit(()), None)
+    keys = _keys(every)
+    for k in range(1, len(every)):
+        # What was once judged stays so.
+        if keys[k] not in twin.foretold:
+            twin.foretold[keys[k]] = _learnt(loop, every[:k], keys[:k]).foretold(every[k])
+    foretold = [twin.foretold[key] for key in keys[1:]]
+    learnt = _learnt(loop, every, keys).scaled(scale_of(foretold, sure if foretold or unproved is None else unproved))
+    return Belief(loop, learnt.posterior, learnt, foretold[-1].mistake if foretold else 0.0)
 
 
-def _foretold(loop: TwinLoop, before: tuple[Episode, ...], episode: Episode) -> tuple[Foretold, NDArray[np.float64]]:
-    """How well those before foretold an episode, and their mode. What was once judged stays so, and is remembered."""
-    remembered = loop.twin.foretold
-    content = [part for e in (*before, episode) for part in (e.input, e.output_start, e.output_end)]
-    key = hashlib.blake2b(b"".join(part.tobytes() for part in content)).digest()
-    if key not in remembered:
-        posterior = loop.twin.fit(before)
-        remembered[key] = Discrepancy(posterior, before, loop.features).foretold(episode), posterior.mode
-    return remembered[key]
+def _learnt(loop: TwinLoop, episodes: Sequence[Episode], keys: Sequence[bytes]) -> Discrepancy:
+    """Of the newest of these episodes, with the scale 1. What was learnt last is remembered: it is to foretell what comes next."""
+    twin = loop.twin
+    if keys[-1] not in twin.newest:
+        newest = tuple(episodes[-TRACES_MAX:])
+        posterior = twin.fit(newest, guess=twin.modes[keys[-2]] if len(keys) > 1 else None)
+        twin.modes[keys[-1]] = posterior.mode
+        twin.newest.clear()
+        twin.newest[keys[-1]] = Discrepancy(posterior, newest, loop.features)
+    return twin.newest[keys[-1]]
+
+
+def _keys(episodes: Sequence[Episode]) -> list[bytes]:
+    """Of each of these episodes what it and all before it contain."""
+    digest, out = hashlib.blake2b(), []
+    for one in episodes:
+        for part in (one.input, one.output_start, one.output_end):
+            digest.update(part.tobytes())
+        out.append(digest.digest())
+    return out

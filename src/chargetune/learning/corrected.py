@@ -36,7 +36,7 @@ PROVED = 2
 # Of a value: a twin that foretold every score to the last digit leaves nothing to be scaled by.
 LEAST = 1e-9
 # In units of s, f is never as far from its mean.
-FAR = 100.0
+FAR = 20.0
 
 
 def most_promising(

@@ -16,7 +16,7 @@ from gpytorch.means import ZeroMean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky
 
 from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
@@ -75,6 +75,12 @@ class Discrepancy:
     def __post_init__(self) -> None:
         if not 1 <= len(self.features) <= len(LENGTH):
             raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {len(LENGTH)}")
+
+    def scaled(self, scale: float) -> Discrepancy:
+        """The same with another scale, which the hyperparameters do not depend on: they are those of the residuals."""
+        other = replace(self, scale=scale)
+        vars(other).update(_data=self._data, _fitted=self._fitted)
+        return other
 
     def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
         """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
@@ -163,25 +169,39 @@ class Discrepancy:
         return np.nan_to_num(np.concatenate(out), nan=0.0)
 
     @cached_property
-    def _parts(self) -> tuple[_Part, ...]:
+    def _data(self) -> _Data:
         twin = self.posterior.twin
-        left = self._residuals(self.posterior.mode)
         counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
-        nodes = self.lattice.nodes
         at = np.concatenate([self._at(episode) for episode in self.episodes])
-        weights = self.lattice.weights(at)
-        inputs = np.array([name in twin.model.input_names for name in self.features])
+        noise = np.array(list(twin.noise_sd.values()))
+        return _Data(self.lattice.unit(at), self.lattice.weights(at), noise**2 / np.maximum(counts, 1e-9))
+
+    @cached_property
+    def _inputs(self) -> NDArray[np.bool_]:
+        """Which features are inputs."""
+        return np.array([name in self.posterior.twin.model.input_names for name in self.features])
+
+    def _inert(self, name: str) -> bool:
+        """A state does not jump with the input, and neither does what the twin has wrong of it."""
+        return name in self.posterior.twin.model.state_names and not self._inputs.all()
+
+    @cached_property
+    def _fitted(self) -> tuple[_Fitted, ...]:
+        left, data = self._residuals(self.posterior.mode), self._data
+        on = [np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd]
+        return tuple(_fit(data.at * one, left[:, i], data.variance[:, i], self.lattice.nodes * one) for i, one in enumerate(on))
+
+    @cached_property
+    def _parts(self) -> tuple[_Part, ...]:
+        twin, nodes, inputs, data = self.posterior.twin, self.lattice.nodes, self._inputs, self._data
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
         flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs.any() else np.ones(len(nodes))
         parts = []
-        for i, (name, noise) in enumerate(twin.noise_sd.items()):
-            # A state does not jump with the input, and neither does what the twin has wrong of it.
-            inert = name in twin.model.state_names and not inputs.all()
-            on = np.where(inputs & inert, 0.0, 1.0)
-            least = self.scale * twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if inert else flowing)
-            variance = noise**2 / np.maximum(counts[:, i], 1e-9)
-            parts.append(_part(self.lattice.unit(at) * on, left[:, i], variance, nodes * on, weights, least))
+        for i, (name, fitted) in enumerate(zip(twin.noise_sd, self._fitted, strict=True)):
+            least = self.scale * twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing)
+            # One trajectory that the model fits says little of others.
+            parts.append(_part(fitted.kernel * (fitted.variance + np.outer(least, least)), data.variance[:, i], data.weights))
         return tuple(parts)
 
 
@@ -221,6 +241,25 @@ class _Off(NamedTuple):
     """Whether it was measured."""
 
 
+class _Data(NamedTuple):
+    """The stretches that are learnt from."""
+
+    at: NDArray[np.float64]
+    """Features as shares of their ranges, shape (stretches, features)."""
+    weights: NDArray[np.float64]
+    """Values at the nodes -> values there, shape (stretches, nodes)."""
+    variance: NDArray[np.float64]
+    """Of the mean residual by noise, shape (stretches, outputs)."""
+
+
+class _Fitted(NamedTuple):
+    """What the residuals of one output ask for."""
+
+    kernel: NDArray[np.float64]
+    """Correlation of the nodes, shape (nodes, nodes)."""
+    variance: float
+
+
 @dataclass(frozen=True)
 class _Part:
     """One output: residuals -> mean at the nodes, prior covariance at the nodes, and what of it the data take away."""
@@ -242,18 +281,16 @@ class _Part:
     def root(self) -> NDArray[np.float64]:
         """A factor of the covariance, which neighbouring nodes leave singular to rounding."""
         rest = self.prior - self.gain @ self.cross
-        values, vectors = np.linalg.eigh((rest + rest.T) / 2)
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+        rest = (rest + rest.T) / 2
+        try:
+            return np.asarray(cholesky(rest + JITTER * np.max(np.diag(self.prior)) * np.eye(len(rest)), lower=True))
+        except LinAlgError:
+            # Where the data are far surer than the prior rounding is larger; this takes ten times as long.
+            values, vectors = np.linalg.eigh(rest)
+            return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _part(
-    x: NDArray[np.float64],
-    left: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    lattice: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    least: NDArray[np.float64],
-) -> _Part:
+def _fit(x: NDArray[np.float64], left: NDArray[np.float64], variance: NDArray[np.float64], nodes: NDArray[np.float64]) -> _Fitted:
     size = float(np.sqrt(np.mean(left**2))) or 1.0
     d = x.shape[1]
     # In units of their prior medians all length scales have the same prior.
@@ -268,9 +305,10 @@ def _part(
     )  # fmt: skip
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     with torch.no_grad():
-        prior = kernel(torch.as_tensor(lattice / medians)).to_dense().numpy()
-        # One trajectory that the model fits says little of others.
-        prior *= size**2 * float(scaled.outputscale) + np.outer(least, least)
+        return _Fitted(kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), size**2 * float(scaled.outputscale))
+
+
+def _part(prior: NDArray[np.float64], variance: NDArray[np.float64], weights: NDArray[np.float64]) -> _Part:
     cross = weights @ prior
     seen = cho_factor(cross @ weights.T + np.diag(variance + JITTER * prior[0, 0]), lower=True)
     return _Part(cho_solve(seen, cross).T, prior, cross)

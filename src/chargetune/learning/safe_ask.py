@@ -29,8 +29,10 @@ SURE, SURE_UNPROVED = 0.84, 0.93
 AIMED = 0.8
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
-# A round that moves no entry by more than this share of its range was the last one.
-SETTLED = 2e-3
+# A round that moves no entry by more than this share of its range was the last one,
+SETTLED = 5e-3
+# or that changes the objective expected of what is safe by less than this share: the search that follows goes the rest of the way.
+UNCHANGED = 1e-3
 # Beyond one limit's quantile, because several windows have to hold together.
 TOGETHER = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
@@ -88,13 +90,16 @@ class SafeAsk(Ask):
             score = None if expected is None else self.loop.score(expected)
             if score is None:
                 break
-            following = self.covered(candidate, deviations)
-            if self._safe(candidate):
+            safe = self._safe(candidate)
+            if safe:
                 passed.append((score.objective, candidate))
-            elif k > 1:
-                deviations *= WIDER
+                if len(passed) > 1 and abs(passed[-1][0] - passed[-2][0]) < UNCHANGED * abs(passed[-1][0]):
+                    break
+            following = self.covered(candidate, deviations)
             if following is None:
                 break
+            if not safe and k > 1:
+                deviations *= WIDER
             # A margin is smaller at the smaller current that it leads to: two thetas would answer each other for ever.
             theta, before = following if k < 1 else (theta + following) / 2, theta
             if passed and self.moved(before, theta) < SETTLED:
@@ -121,7 +126,8 @@ class SafeAsk(Ask):
         if score is None or not known:
             return theta
         margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
-        allowed = np.nanmax(windows_of(score) + margin, initial=0.0) - margin
+        # Where this one keeps less than the margin another may too, and nowhere else.
+        allowed = np.fmax(windows_of(score), -margin)
         near = theta
         for _ in range(NEARINGS):
             near = nearest(search, self.space, known[0], near, score.objective, allowed)

@@ -29,7 +29,7 @@ from chargetune.learning.sections import sections
 from chargetune.model.model import Model
 
 if TYPE_CHECKING:
-    from chargetune.learning.discrepancy import Foretold
+    from chargetune.learning.discrepancy import Discrepancy, Foretold
 
 __all__ = ["BLOCKS", "Twin", "Uncertain", "blocks"]
 
@@ -117,8 +117,18 @@ class Twin:
         return tuple(1 if one.kind in ("start", "bias") else self.model.parameter_blocks[one.name] for one in self.unknowns)
 
     @cached_property
-    def foretold(self) -> dict[bytes, tuple[Foretold, NDArray[np.float64]]]:
-        """How well episodes were foretold, and the modes by which, as far as it is known (`belief.believe`)."""
+    def foretold(self) -> dict[bytes, Foretold]:
+        """How well episodes were foretold, as far as it is known (`belief.believe`)."""
+        return {}
+
+    @cached_property
+    def modes(self) -> dict[bytes, NDArray[np.float64]]:
+        """Modes after some episodes: the next search begins there."""
+        return {}
+
+    @cached_property
+    def newest(self) -> dict[bytes, Discrepancy]:
+        """What was learnt last, posterior included. It is large, and no other is kept."""
         return {}
 
     @property
