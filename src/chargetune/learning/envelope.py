@@ -27,6 +27,8 @@ UNCOVERED = 1e4
 MOVING = 1e-3
 # The rows are linearised at the theta of the episode, and once more at the first solution.
 LINEARISATIONS = 2
+# Of what is noticed of a limit, the difference from a straight line that is none.
+STRAIGHT = 1e-6
 # A row of which neither plant nor controller was ever closer to its limit than this share of its spread is not covered.
 REACH = 0.25
 # An input within this share of its range is at its bound.
@@ -157,8 +159,6 @@ def covering(
     # In units of what is noticed of each limit, kelvin and volt count alike.
     scale = np.concatenate([np.full(limit.rows.size1_out(0), limit.scale) for limit in controller.limits])
     for number in range(LINEARISATIONS):
-        if number:
-            rows, slopes = predicted_rows(controller, episode, theta)
         # Where the input is at its bound the limit does not decide it: there the prediction only has to stay below.
         idle = full[:, None, None] & (measured <= 0)
         wanted = np.where(near, (np.where(idle, 0.0, measured) - rows) / scale, np.nan).ravel()
@@ -181,7 +181,14 @@ def covering(
         found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=np.stack([np.zeros_like(most), most], axis=1), method="highs")
         if found.x is None:
             return theta
-        theta = np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
+        before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
+        if number + 1 == LINEARISATIONS:
+            break
+        straight = rows + slopes @ (theta - before)
+        rows, slopes = predicted_rows(controller, episode, theta)
+        if np.all(np.abs(rows - straight) <= STRAIGHT * scale, where=np.isfinite(straight)):
+            # They are linear in what has changed, as in a backoff or in R0: the same program would lead here again.
+            break
     return np.asarray(theta, dtype=np.float64)
 
 
