@@ -35,8 +35,8 @@ Candidate = tuple[NDArray[np.float64], Prediction]
 PROVED = 2
 # Of a value: a twin that foretold every score to the last digit leaves nothing to be scaled by.
 LEAST = 1e-9
-# In units of s, f is never as far from its mean.
-FAR = 20.0
+# In units of s, f is never as far from its mean: the probability is 1e-15.
+FAR = 8.0
 
 
 def most_promising(
