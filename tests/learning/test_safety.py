@@ -13,9 +13,10 @@ from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import LimitBackoff
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.episode import Ending
-from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
+from chargetune.learning import NoSafeThetaError, Safety, TwinTuner, safe_ask
 from chargetune.learning.ask import Ask
-from chargetune.learning.belief import believe
+from chargetune.learning.belief import believe, windows_of
+from chargetune.learning.nearest import nearest
 from chargetune.learning.safe_ask import SafeAsk
 from chargetune.plants.sensors import Sensors
 
@@ -181,6 +182,22 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
     assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
     found = [ask._furthest(theta, aim) for aim in aims]
     assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, None]
+
+
+def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_does(monkeypatch):
+    seen = []
+
+    def noted(search, space, goal, theta, promised, allowed):
+        windows = windows_of(search.score(space.to_unit(theta)))
+        seen.append((windows, allowed))
+        return nearest(search, space, goal, theta, promised, allowed)
+
+    monkeypatch.setattr(safe_ask, "nearest", noted)
+    problem = charge(charge_time_to_soc=0.95, plant_model=TwoPairs(CELL))
+    learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
+    for windows, allowed in seen:
+        assert np.all(allowed <= np.maximum(np.nan_to_num(windows), 0.0))
+    assert len(seen) > 2
 
 
 def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():

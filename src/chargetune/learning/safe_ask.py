@@ -125,7 +125,7 @@ class SafeAsk(Ask):
         score, known = search.score(self.space.to_unit(theta)), self._kept()
         if score is None or not known:
             return theta
-        margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
+        margin = np.maximum(np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score)), 0.0)
         # Where this one keeps less than the margin another may too, and nowhere else.
         allowed = np.fmax(windows_of(score), -margin)
         near = theta
