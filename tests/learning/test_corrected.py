@@ -51,6 +51,16 @@ def corrected(trials, thetas):
     return _Corrected(SPACE, done, known), known
 
 
+def fitted(model, output):
+    """(kernel, noise variance) of one output."""
+    (part,) = model._model.models
+
+    def kernel(one, other):
+        return part.covar_module(torch.tensor(one), torch.tensor(other)).to_dense()[output].detach().numpy()
+
+    return kernel, float(part.likelihood.noise[output].detach())
+
+
 TRIALS = tried((0.1, 0.2), (0.3, 0.4), (0.45, 0.1), objective=0.03, voltage=0.05)
 THETAS = [(0.4, 0.3), (0.5, 0.2), (0.6, 0.6)]
 
@@ -63,11 +73,7 @@ def test_the_prediction_is_the_twin_and_a_gaussian_process_of_what_it_left():
         mean, variance = found.mean[:, 0].detach().numpy(), found.variance[:, 0].detach().numpy()
         x = np.array([t.theta for t in TRIALS])
         for output, (left, own) in enumerate([(0.03, lambda s: s.objective), (0.05, lambda s: s.excess["voltage"] - 0.1)]):
-            part = model._model.models[output]
-            k, noise = part.covar_module, float(part.likelihood.noise.detach())
-
-            def kernel(one, other, k=k):
-                return k(torch.tensor(one), torch.tensor(other)).to_dense().detach().numpy()
+            kernel, noise = fitted(model, output)
 
             # Every residual is the same, so it is the unit.
             gain = np.linalg.solve(kernel(x, x) + noise * np.eye(3), kernel(x, np.array(THETAS)))
@@ -90,9 +96,9 @@ def test_its_acquisition_is_that_of_monte_carlo():
         draws = np.random.default_rng(2).standard_normal((400_000, 3, 2))
         y = found.mean[:, 0].detach().numpy() + draws * found.variance[:, 0].sqrt().detach().numpy()
         # All trials are believed to have kept the limits; the best is the newest, by what is left of its residual when noise is taken out.
-        part, x = model._model.models[0], torch.tensor([t.theta for t in TRIALS])
-        k = part.covar_module(x, x).to_dense().detach().numpy()
-        smooth = k @ np.linalg.solve(k + float(part.likelihood.noise.detach()) * np.eye(3), np.ones(3))
+        kernel, noise = fitted(model, 0)
+        k = kernel([t.theta for t in TRIALS], [t.theta for t in TRIALS])
+        smooth = k @ np.linalg.solve(k + noise * np.eye(3), np.ones(3))
         best = verdict(TRIALS[2].theta).objective / 0.03 + smooth[2]
         gain = np.maximum(y[..., 0] - best, 0.0) * np.all(y[..., 1:] <= 0.0, axis=-1)
     np.testing.assert_allclose(values, gain.mean(axis=0), atol=5 * gain.std(axis=0).max() / np.sqrt(len(gain)))

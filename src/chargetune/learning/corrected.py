@@ -13,7 +13,7 @@ from botorch.models.model import Model
 from botorch.models.model_list_gp_regression import ModelListGP
 from botorch.posteriors.gpytorch import GPyTorchPosterior
 from gpytorch.distributions import MultitaskMultivariateNormal
-from gpytorch.means import Mean
+from gpytorch.means import ZeroMean
 from linear_operator.operators import DiagLinearOperator
 from numpy.typing import NDArray
 
@@ -85,30 +85,33 @@ class _Corrected(Model):
         near[0] = True
         measured, foretold, scale = measured[:, near], foretold[:, near], scale[near]
         points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for theta, _ in known)]))
-        x, y = torch.as_tensor(points[: len(done)]), torch.as_tensor(measured / scale)
-        self._model = ModelListGP(
-            *(GaussianProcess(mean=_table(points, foretold[:, i] / scale[i]), standardise=False).fit(x, y[:, i]) for i in range(len(scale)))
-        )
-        spread = np.array([e.std(axis=0) for e in ensembles])[:, near]
-        self._spread = [_table(points[len(done) :], spread[:, i] / scale[i])() for i in range(len(scale))]
+        x, left = torch.as_tensor(points[: len(done)]), torch.as_tensor((measured - foretold[: len(done)]) / scale)
+        self._model = ModelListGP(GaussianProcess(mean=ZeroMean, standardise=False).fit(x, left))
+        self._foretold = _Table(points, foretold / scale)
+        self._spread = _Table(points[len(done) :], np.array([e.std(axis=0) for e in ensembles])[:, near] / scale)
+        self._outputs = len(scale)
         with torch.no_grad():
-            mean, _ = marginals(self._model, x[:, None, :])
+            mean, _ = self._marginals(x[:, None, :])
         kept = mean[(mean[:, 1:] <= 0.0).all(dim=-1), 0]
         self._best = float(kept.max()) if len(kept) else None
 
     @property
     def num_outputs(self) -> int:
-        return len(self._spread)
+        return self._outputs
 
     @property
     def batch_shape(self) -> torch.Size:
         return torch.Size()
 
+    def _marginals(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and sd of m + f at single points x (b, 1, d), shapes (b, outputs)."""
+        mean, sd = marginals(self._model, x)
+        return self._foretold(x) + mean, sd
+
     def posterior(self, X: torch.Tensor, *_: Any, **__: Any) -> GPyTorchPosterior:
         """At single points X (b, 1, d); the outputs are independent."""
-        mean, sd = marginals(self._model, X)
-        spread = torch.stack([part(X)[..., 0] for part in self._spread], dim=-1)
-        return GPyTorchPosterior(MultitaskMultivariateNormal(mean[..., None, :], DiagLinearOperator(sd**2 + spread**2)))
+        mean, sd = self._marginals(X)
+        return GPyTorchPosterior(MultitaskMultivariateNormal(mean[..., None, :], DiagLinearOperator(sd**2 + self._spread(X) ** 2)))
 
     def acquisition(self) -> AcquisitionFunction:
         limits: dict[int, tuple[float | None, float | None]] = dict.fromkeys(range(1, self.num_outputs), (None, 0.0))
@@ -123,18 +126,12 @@ def _values(score: Score) -> list[float]:
     return [score.objective, *(worst - score.tolerance.get(name, 0.0) for name, worst in score.excess.items())]
 
 
-class _Table(Mean):  # type: ignore[misc] # gpytorch has no types
-    """A mean function that is known at some points."""
+class _Table:
+    """Values of every output that are known at some points."""
 
     def __init__(self, points: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-        super().__init__()
-        self._values = {p.tobytes(): float(v) for p, v in zip(points, values, strict=True)}
+        self._values = {p.tobytes(): v for p, v in zip(points, values, strict=True)}
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """x (..., d) -> (...)."""
-        rows = x.detach().numpy().reshape(-1, x.shape[-1])
-        return torch.tensor([self._values[np.ascontiguousarray(row).tobytes()] for row in rows]).reshape(x.shape[:-1])
-
-
-def _table(points: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
-    return lambda: _Table(points, values)
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """x (b, 1, d) -> (b, outputs)."""
+        return torch.as_tensor(np.array([self._values[np.ascontiguousarray(row).tobytes()] for row in x.detach().numpy()[:, 0]]))
