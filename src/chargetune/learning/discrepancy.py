@@ -188,8 +188,8 @@ class Discrepancy:
     @cached_property
     def _fitted(self) -> tuple[_Fitted, ...]:
         left, data = self._residuals(self.posterior.mode), self._data
-        on = [np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd]
-        return tuple(_fit(data.at * one, left[:, i], data.variance[:, i], self.lattice.nodes * one) for i, one in enumerate(on))
+        on = np.array([np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd])[:, None]
+        return _fit(data.at * on, left.T, data.variance.T, self.lattice.nodes * on)
 
     @cached_property
     def _parts(self) -> tuple[_Part, ...]:
@@ -290,22 +290,28 @@ class _Part:
             return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _fit(x: NDArray[np.float64], left: NDArray[np.float64], variance: NDArray[np.float64], nodes: NDArray[np.float64]) -> _Fitted:
-    size = float(np.sqrt(np.mean(left**2))) or 1.0
-    d = x.shape[1]
+def _fit(
+    x: NDArray[np.float64], left: NDArray[np.float64], variance: NDArray[np.float64], nodes: NDArray[np.float64]
+) -> tuple[_Fitted, ...]:
+    """One process an output, all at once: x (outputs, n, d), residuals and their variance by noise (outputs, n), nodes (outputs, K, d)."""
+    sizes = np.sqrt(np.mean(left**2, axis=1))
+    sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
+    count, _, d = x.shape
+    batch = torch.Size([count])
     # In units of their prior medians all length scales have the same prior.
     medians = np.array(LENGTH[:d])
-    kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD))
-    scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0))
+    kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD), batch_shape=batch)
+    scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
     model = SingleTaskGP(
-        torch.as_tensor(x / medians), torch.as_tensor(left[:, None] / size),
-        torch.as_tensor(np.minimum(variance / size**2, 1e6)[:, None]),
+        torch.as_tensor(x / medians), torch.as_tensor(left / sizes)[..., None],
+        torch.as_tensor(np.minimum(variance / sizes**2, 1e6))[..., None],
         covar_module=scaled, mean_module=ZeroMean(),
         outcome_transform=None, input_transform=None,
     )  # fmt: skip
     fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     with torch.no_grad():
-        return _Fitted(kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), size**2 * float(scaled.outputscale))
+        kernels, scales = kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
+    return tuple(_Fitted(k, float(size**2 * scale)) for k, size, scale in zip(kernels, sizes[:, 0], scales, strict=True))
 
 
 def _part(prior: NDArray[np.float64], variance: NDArray[np.float64], weights: NDArray[np.float64]) -> _Part:
