@@ -224,9 +224,9 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
     tuner = TwinTuner(ChargingTwin(problem))
     belief = believe(tuner.loop, trials)
     chances = [predicted.probability() for _, predicted in cautious(Ask(tuner.loop, problem.space, belief, trials, 3), theta)]
-    assert belief.predict(theta, 64, 3).probability() < 0.5
-    assert chances[0] > 0.8
+    assert belief.predict(theta, 64, 3).probability() < 0.1
     assert min(chances) >= 0.5
+    assert np.mean(chances) > 0.8
 
 
 def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first():

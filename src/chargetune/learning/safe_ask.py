@@ -33,8 +33,10 @@ ROUNDS = 7
 SETTLED = 5e-3
 # or that changes the objective expected of what is safe by less than this share: the search that follows goes the rest of the way.
 UNCHANGED = 1e-3
-# Beyond one limit's quantile, because several windows have to hold together.
-TOGETHER = 1.0
+# A window that so many standard deviations keep below its limit does not count among those that have to hold together.
+NEAR = 3.0
+# Beyond the quantile for these windows together: draws are few, and not Gaussian.
+BEYOND = 0.5
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
 # Factor on the deviations where they do not suffice.
@@ -83,7 +85,7 @@ class SafeAsk(Ask):
 
     def _rounds(self, theta: NDArray[np.float64]) -> tuple[list[Candidate], float]:
         """From theta on, thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
-        deviations = float(norm.ppf(self.safety.probability)) + (TOGETHER if self.belief.proved else TOGETHER + UNPROVED)
+        deviations = self._deviations(self.candidate(theta))
         passed: list[tuple[float, Candidate]] = []
         for k in range(ROUNDS):
             expected, candidate = self.belief.central(theta), self.candidate(theta)
@@ -105,6 +107,15 @@ class SafeAsk(Ask):
             if passed and self.moved(before, theta) < SETTLED:
                 break
         return [one for _, one in sorted(passed, key=lambda one: -one[0])], deviations
+
+    def _deviations(self, candidate: Candidate) -> float:
+        """Standard deviations that keep each of n windows so surely that all are kept as stated: the quantile of p^(1/n) (Sidak).
+
+        n: how many the candidate may break.
+        """
+        near = int(np.sum(candidate[1].upper_windows(NEAR) > 0))
+        together = float(norm.ppf(self.safety.probability ** (1 / max(near, 1))))
+        return together + BEYOND + (0.0 if self.belief.proved else UNPROVED)
 
     def _expected_best(self) -> NDArray[np.float64]:
         """What the plant would allow if the belief were true: from there on caution only takes back."""
