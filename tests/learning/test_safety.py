@@ -200,6 +200,16 @@ def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_d
     assert len(seen) > 2
 
 
+@pytest.mark.parametrize("near", [0, 1, 3, 10])
+def test_as_many_deviations_are_kept_back_as_the_windows_that_may_break_need_together(near):
+    """Monte Carlo: independent windows, each so many standard deviations below its limit, are all kept with the stated probability."""
+    ask = SafeAsk(None, None, SimpleNamespace(proved=True), [], 0, Safety(probability=0.9), 5)
+    windows = np.array([0.2] * near + [-0.5] * 20 + [np.nan])
+    deviations = ask._deviations((None, SimpleNamespace(upper_windows=lambda _: windows))) - safe_ask.BEYOND
+    kept = np.all(np.random.default_rng(near).standard_normal((100_000, max(near, 1))) <= deviations, axis=1)
+    assert kept.mean() == pytest.approx(0.9, abs=0.005)
+
+
 def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
     problem = charge(noise=0.0)
     trials = []
