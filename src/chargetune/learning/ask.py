@@ -26,6 +26,8 @@ DRAWS, DRAWS_UNPROVED = 32, 64
 AIMED = 0.5
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
+# Of the objective, what an iteration of it has to win that another one follows.
+WON = 1e-3
 # Of the objective, what another search would have to win.
 WORTH = 0.01
 
@@ -77,8 +79,9 @@ class Ask:
         search = Search(self.loop, self.belief.expected, self.space, np.nan_to_num(margin))
         start = self.space.to_unit(theta)
         search.scale([start, self.space.to_unit(self.space.default)])
-        search.refine(start, POLISHING)
-        return self.candidate(self.space.from_unit(search.best(None if kept else start)))
+        than = None if kept else start
+        search.refine(start, POLISHING, WON, than)
+        return self.candidate(self.space.from_unit(search.best(than)))
 
     def as_good(self, theta: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
         """Whether the objective expected of theta is that of another, less the share `WORTH` at most."""

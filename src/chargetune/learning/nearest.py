@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from chargetune.learning.belief import windows_of
-from chargetune.learning.twin_search import STEP, Search
+from chargetune.learning.twin_search import STEP, STUCK, Search
 from chargetune.model.parameters import ParameterSpace
 
 __all__ = ["nearest"]
 
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
-ITERATIONS = 20
+ITERATIONS = 12
 # From afar SLSQP may end beside what is allowed: then a part of that way may do.
 PARTS = (0.8, 0.6, 0.4, 0.2)
 # Windows further inside their limits than so many tolerances say nothing.
@@ -25,6 +27,9 @@ ROUNDING = 0.1
 # in tolerances it went on for a thousandth of one, four times as long.
 CLOSE = 1e-5
 UNIT = CLOSE / ROUNDING
+# An iteration that moves no entry by more than this is the last one once a point as near to it was kept: close to its goal the distance
+# is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, for as long as it may.
+SETTLED = 5e-3
 
 
 def nearest(
@@ -71,16 +76,27 @@ def nearest(
         # A window that is entered or left by a step has no slope.
         return UNIT * np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
 
-    end = minimize(
-        lambda u: 0.5 * float(np.sum((u - to) ** 2)),
-        first,
-        jac=lambda u: u - to,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * first.size,
-        constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
-        options={"maxiter": ITERATIONS, "ftol": CLOSE},
-    ).x
+    way = [first]
+
+    def follow(u: NDArray[np.float64]) -> None:
+        way.append(np.array(u))
+        moved = float(np.max(np.abs(way[-1] - way[-2])))
+        if moved < STUCK or (moved < SETTLED and any(np.max(np.abs(np.frombuffer(key) - u)) < SETTLED for key in seen)):
+            raise StopIteration
+
+    # Older SciPy lets it through, newer ends there.
+    with suppress(StopIteration):
+        minimize(
+            lambda u: 0.5 * float(np.sum((u - to) ** 2)),
+            first,
+            jac=lambda u: u - to,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * first.size,
+            constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
+            options={"maxiter": ITERATIONS, "ftol": CLOSE},
+            callback=follow,
+        )
     for share in PARTS:
-        constraint(first + share * (end - first))
+        constraint(first + share * (way[-1] - first))
     found = min(seen, key=lambda key: seen[key], default=None)
     return start if found is None else space.from_unit(np.frombuffer(found))

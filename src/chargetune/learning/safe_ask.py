@@ -32,7 +32,7 @@ ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one,
 SETTLED = 5e-3
 # or that changes the objective expected of what is safe by less than this share: the search that follows goes the rest of the way.
-UNCHANGED = 1e-3
+UNCHANGED = 3e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
 # Beyond the quantile for these windows together: draws are few, and not Gaussian.
@@ -85,10 +85,11 @@ class SafeAsk(Ask):
 
     def _rounds(self, theta: NDArray[np.float64]) -> tuple[list[Candidate], float]:
         """From theta on, thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
-        deviations = self._deviations(self.candidate(theta))
+        candidate = self.candidate(theta)
+        deviations = self._deviations(candidate)
         passed: list[tuple[float, Candidate]] = []
         for k in range(ROUNDS):
-            expected, candidate = self.belief.central(theta), self.candidate(theta)
+            candidate, expected = self.candidate(theta) if k else candidate, self.belief.central(theta)
             score = None if expected is None else self.loop.score(expected)
             if score is None:
                 break

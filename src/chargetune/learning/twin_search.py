@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ PENALTY = 10.0
 # is left to noise and to what the twin does not know.
 AIMED, ACCEPTED = -0.5, 0.0
 STEP = 2e-3
+# Where no linear program holds, SLSQP takes back every step until little is left of it, time and again.
+STUCK = 5e-4
 # Far inside a limit its excess says nothing: windows are cut here, in scaled units.
 FAR = -1.0
 
@@ -72,24 +75,42 @@ class Search:
         excess = [float(np.nanmax(windows_of(s, AIMED), initial=0.0)) for s in scores]
         self._unit = (float(np.ptp(objective)) or 1.0 if objective else 1.0, max(excess, default=0.0) or 1.0)
 
-    def refine(self, start: NDArray[np.float64], iterations: int) -> None:
-        """SLSQP with finite differences of ``STEP``; every point it visits is remembered."""
+    def refine(self, start: NDArray[np.float64], iterations: int, gain: float = 0.0, than: NDArray[np.float64] | None = None) -> None:
+        """SLSQP with finite differences of ``STEP``; every point it visits is remembered.
+
+        With a ``gain`` it ends with the first iteration that wins less than this share of the objective after others won more, and
+        with one that hardly moves (`STUCK`). What counts is the objective of what `best` would choose with ``than``.
+        """
         if self.score(start) is None:
             return
+        allowed = self._allowed(than)
+        won, way = [self._won(allowed)], [start]
+
+        def follow(u: NDArray[np.float64]) -> None:
+            won.append(self._won(allowed))
+            way.append(np.array(u))
+            worth = gain * abs(won[-1])
+            stuck = gain > 0.0 and np.max(np.abs(way[-1] - way[-2])) < STUCK
+            if stuck or won[-2] - won[0] >= worth > won[-1] - won[-2]:
+                raise StopIteration
+
         constraint: dict[str, Any] = {
             "type": "ineq",
             "fun": lambda u: -np.maximum(self._values(u)[1], FAR),
             "jac": lambda u: -self._derivatives(u)[1],
         }
-        minimize(
-            lambda u: self._values(u)[0],
-            start,
-            jac=lambda u: self._derivatives(u)[0],
-            method="SLSQP",
-            bounds=[(0.0, 1.0)] * start.size,
-            constraints=[constraint],
-            options={"maxiter": iterations, "ftol": 1e-6},
-        )
+        # Older SciPy lets it through, newer ends there.
+        with suppress(StopIteration):
+            minimize(
+                lambda u: self._values(u)[0],
+                start,
+                jac=lambda u: self._derivatives(u)[0],
+                method="SLSQP",
+                bounds=[(0.0, 1.0)] * start.size,
+                constraints=[constraint],
+                options={"maxiter": iterations, "ftol": 1e-6},
+                callback=follow,
+            )
 
     def merit(self, u: NDArray[np.float64]) -> float:
         value, excess = self._values(u)
@@ -97,7 +118,7 @@ class Search:
 
     def best(self, start: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """The seen point of the best objective that keeps the limits, or breaks them as little as ``start``; else of the least excess."""
-        allowed = 0.0 if start is None else max(0.0, self._worst(self.score(start)))
+        allowed = self._allowed(start)
 
         def rank(key: bytes) -> tuple[bool, float]:
             score = self._seen[key]
@@ -105,6 +126,13 @@ class Search:
             return worst > allowed, -score.objective if score is not None and worst <= allowed else worst
 
         return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
+
+    def _allowed(self, start: NDArray[np.float64] | None) -> float:
+        return 0.0 if start is None else max(0.0, self._worst(self.score(start)))
+
+    def _won(self, allowed: float) -> float:
+        """The best objective seen whose windows are all at most as allowed; -inf where there is none."""
+        return max((s.objective for s in self._seen.values() if s is not None and self._worst(s) <= allowed), default=-np.inf)
 
     def _worst(self, score: Score | None) -> float:
         """Of the windows, in tolerances; inf where there is no episode."""
