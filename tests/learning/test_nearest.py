@@ -43,3 +43,23 @@ def test_a_theta_that_promises_no_more_is_not_worth_a_step():
     theta = best + np.array([1e-4, 0.1, 0.3, -0.5, 0.2])
     found = nearest(search(), SPACE, best, theta, float(SPACE.to_unit(theta)[0]), np.zeros(1))
     np.testing.assert_allclose(found, best, rtol=0, atol=1e-9)
+
+
+def test_it_ends_where_it_is_not_left_to_run_back_and_forth():
+    # Eleven windows, each with its own bent limit, u_i + 3 (u_i+1 - 0.5)^2 <= 0.5, and a best theta beyond all: the nearest has all at 0.5.
+    space, simulated = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5, size=11),)), []
+
+    def simulate(thetas):
+        simulated.extend(thetas)
+        return [space.to_unit(theta) for theta in thetas]
+
+    def score(u):
+        windows = u - 0.5 + 3.0 * (np.roll(u, -1) - 0.5) ** 2
+        return Score(float(u.sum()), float(u.sum()), {"limit": windows.max()}, {"limit": 1e-3}, profile={"limit": tuple(windows)})
+
+    start = np.random.default_rng(0).uniform(0.1, 0.4, 11)
+    found = nearest(Search(SimpleNamespace(score=score), simulate, space), space, np.full(11, 0.6), start, start.sum(), np.full(11, -1.0))
+    # A tenth of the tolerance is rounding.
+    np.testing.assert_allclose(found, 0.5, rtol=0, atol=1e-3)
+    # Four times as many when SLSQP ends by itself, after as many iterations as it may take.
+    assert len(simulated) < 100

@@ -31,8 +31,9 @@ AIMED = 0.8
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one,
 SETTLED = 5e-3
-# or that changes the objective expected of what is safe by less than this share: the search that follows goes the rest of the way.
-UNCHANGED = 3e-3
+# or that changes the objective expected of what is safe by less than this share. Before a trial was foretold no search follows that goes
+# the rest of the way.
+UNCHANGED, UNCHANGED_UNPROVED = 3e-3, 1e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
 # Beyond the quantile for these windows together: draws are few, and not Gaussian.
@@ -88,6 +89,7 @@ class SafeAsk(Ask):
         candidate = self.candidate(theta)
         deviations = self._deviations(candidate)
         passed: list[tuple[float, Candidate]] = []
+        unchanged = UNCHANGED if self.belief.proved else UNCHANGED_UNPROVED
         for k in range(ROUNDS):
             candidate, expected = self.candidate(theta) if k else candidate, self.belief.central(theta)
             score = None if expected is None else self.loop.score(expected)
@@ -96,7 +98,7 @@ class SafeAsk(Ask):
             safe = self._safe(candidate)
             if safe:
                 passed.append((score.objective, candidate))
-                if len(passed) > 1 and abs(passed[-1][0] - passed[-2][0]) < UNCHANGED * abs(passed[-1][0]):
+                if len(passed) > 1 and abs(passed[-1][0] - passed[-2][0]) < unchanged * abs(passed[-1][0]):
                     break
             following = self.covered(candidate, deviations)
             if following is None:
