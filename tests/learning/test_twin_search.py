@@ -73,3 +73,15 @@ def test_one_that_cannot_move_ends_at_once():
     without.refine(np.array([0.0, 0.0]), 60)
     assert search.simulated <= without.simulated
     assert search.simulated < 60
+
+
+@pytest.mark.parametrize("start", [[0.9, 0.5], [0.8, 0.3]])
+def test_what_counts_as_won_is_what_best_would_choose(start):
+    # Of points that break the limit no more than the start one is won on the way to the limit; of those that keep it none before it is there.
+    start = np.array(start)
+    as_start, kept = Counted(0.3), Counted(0.3)
+    as_start.refine(start, 60, 1e-3, start)
+    kept.refine(start, 60, 1e-3)
+    assert as_start.simulated < kept.simulated
+    assert as_start.score(as_start.best(start)).objective > as_start.score(start).objective
+    assert kept.score(kept.best()).objective == pytest.approx(-1.0 - 0.7**2, abs=0.01)
