@@ -77,7 +77,7 @@ def test_one_that_cannot_move_ends_at_once():
 
 @pytest.mark.parametrize("start", [[0.9, 0.5], [0.8, 0.3]])
 def test_what_counts_as_won_is_what_best_would_choose(start):
-    # Of points that break the limit no more than the start one is won on the way to the limit; of those that keep it none before it is there.
+    # Of points that break the limit no more than the start some are won on the way to it, of those that keep it none.
     start = np.array(start)
     as_start, kept = Counted(0.3), Counted(0.3)
     as_start.refine(start, 60, 1e-3, start)
