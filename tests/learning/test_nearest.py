@@ -19,10 +19,16 @@ def search(bend=0.0):
     def simulate(thetas):
         return [SPACE.to_unit(theta) for theta in thetas]
 
-    def score(u):
-        return Score(float(u[0]), float(u[0]), {"limit": float(u[0] - u[1] + bend * (u[0] - 0.5) ** 2 - 0.1)}, {"limit": 0.01})
+    def excess(u):
+        return float(u[0] - u[1] + bend * (u[0] - 0.5) ** 2 - 0.1)
 
-    return Search(SimpleNamespace(score=score), simulate, SPACE)
+    def samples(u):
+        return {"limit": (np.array([excess(u), excess(u) - 0.2]), np.zeros(2, dtype=int))}
+
+    def score(u):
+        return Score(float(u[0]), float(u[0]), {"limit": excess(u)}, {"limit": 0.01})
+
+    return Search(SimpleNamespace(score=score, samples=samples), simulate, SPACE)
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.4])
@@ -53,12 +59,25 @@ def test_it_ends_where_it_is_not_left_to_run_back_and_forth():
         simulated.extend(thetas)
         return [space.to_unit(theta) for theta in thetas]
 
+    def bent(u):
+        return u - 0.5 + 3.0 * (np.roll(u, -1) - 0.5) ** 2
+
+    def samples(u):
+        return {"limit": (bent(u), np.arange(11))}
+
     def score(u):
-        windows = u - 0.5 + 3.0 * (np.roll(u, -1) - 0.5) ** 2
+        windows = bent(u)
         return Score(float(u.sum()), float(u.sum()), {"limit": windows.max()}, {"limit": 1e-3}, profile={"limit": tuple(windows)})
 
     start = np.random.default_rng(0).uniform(0.1, 0.4, 11)
-    found = nearest(Search(SimpleNamespace(score=score), simulate, space), space, np.full(11, 0.6), start, start.sum(), np.full(11, -1.0))
+    found = nearest(
+        Search(SimpleNamespace(score=score, samples=samples), simulate, space),
+        space,
+        np.full(11, 0.6),
+        start,
+        start.sum(),
+        np.full(11, -1.0),
+    )
     # A tenth of the tolerance is rounding.
     np.testing.assert_allclose(found, 0.5, rtol=0, atol=1e-3)
     # Four times as many when SLSQP ends by itself, after as many iterations as it may take.

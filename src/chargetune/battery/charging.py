@@ -343,16 +343,25 @@ class ChargingProblem:
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
             raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
-        excess = {limit.name: limit.excess(episode, self.judged(limit)[0]) for limit in self.limits}
+        samples = self.samples(episode)
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         return Score(
             objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(soc),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
-            excess={name: float(np.max(values)) for name, values in excess.items()},
+            excess={name: float(np.max(values)) for name, (values, _) in samples.items()},
             tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
             metrics=self._metrics(episode) if metrics else {},
-            profile={name: _by_window(soc, values, self.soc_windows) for name, values in excess.items() if name != "voltage_min_V"},
+            profile={name: _by_window(*pair, self.soc_windows) for name, pair in samples.items() if name != "voltage_min_V"},
         )
+
+    def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        """By limit its excess in every interval, as judged, and the window of the SOC that the interval ends in; 0 without a profile."""
+        _, soc = episode.signal("soc")
+        window = np.clip((soc * self.soc_windows).astype(int), 0, self.soc_windows - 1)
+        return {
+            limit.name: (limit.excess(episode, self.judged(limit)[0]), np.zeros_like(window) if limit.name == "voltage_min_V" else window)
+            for limit in self.limits
+        }
 
     def _metrics(self, episode: Episode) -> dict[str, float | None]:
         metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
@@ -407,9 +416,8 @@ class ChargingProblem:
             return None, episode, f"{Ending.SENSOR.value}: {error}"
 
 
-def _by_window(soc: NDArray[np.float64], excess: NDArray[np.float64], windows: int) -> tuple[float | None, ...]:
-    """The worst excess in each of ``windows`` equal parts of 0..1 in SOC; None where no interval ended."""
-    index = np.clip((soc * windows).astype(int), 0, windows - 1)
+def _by_window(excess: NDArray[np.float64], window: NDArray[np.int_], windows: int) -> tuple[float | None, ...]:
+    """The worst excess in each of so many windows; None where no interval ended."""
     worst = np.full(windows, -np.inf)
-    np.maximum.at(worst, index, excess)
+    np.maximum.at(worst, window, excess)
     return tuple(None if value == -np.inf else float(value) for value in worst)

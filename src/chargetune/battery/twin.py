@@ -148,6 +148,9 @@ class ChargingTwin:
         except ValueError:
             return None
 
+    def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        return self._exact.samples(episode)
+
     @cached_property
     def _exact(self) -> ChargingProblem:
         return replace(stand_in(self.problem), soc_windows=WINDOWS)

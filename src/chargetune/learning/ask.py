@@ -65,28 +65,23 @@ class Ask:
             return None
         return covering(self.loop.controller, expected, theta, rows - self.aimed * self.loop.row_tolerances)
 
-    def polished(self, candidate: Candidate, deviations: float, *, kept: bool = False) -> Candidate:
-        """Envelope steps keep the limits and come near the best objective; the rest of the way with the margins held.
-
-        They are held as far as the candidate holds them, or with ``kept`` as far as is found.
-        """
+    def polished(self, candidate: Candidate, deviations: float) -> Candidate:
+        """From a candidate on, the best theta on the expected plant that keeps so many sd of the candidate's ensemble back."""
         theta, predicted = candidate
         expected = self.belief.central(theta)
         score = None if expected is None else self.loop.score(expected)
         if score is None:
             return candidate
-        margin = predicted.upper_windows(deviations) - windows_of(score)
-        search = Search(self.loop, self.belief.expected, self.space, np.nan_to_num(margin))
+        margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
+        search = Search(self.loop, self.belief.expected, self.space, margin, self.aimed)
         start = self.space.to_unit(theta)
-        search.scale([start, self.space.to_unit(self.space.default)])
-        than = None if kept else start
-        search.refine(start, POLISHING, WON, than)
-        return self.candidate(self.space.from_unit(search.best(than)))
+        search.refine(start, POLISHING, WON)
+        return self.candidate(self.space.from_unit(search.best()))
 
-    def as_good(self, theta: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-        """Whether the objective expected of theta is that of another, less the share `WORTH` at most."""
+    def as_good(self, theta: NDArray[np.float64], other: NDArray[np.float64], share: float = WORTH) -> bool:
+        """Whether the objective expected of theta is that of another, less this share of it at most."""
         mine, its = self.belief.scores([theta, other])
-        return mine is not None and its is not None and mine.objective >= its.objective - WORTH * abs(its.objective)
+        return mine is not None and its is not None and mine.objective >= its.objective - share * abs(its.objective)
 
     def most_promising(self, candidates: Sequence[Candidate]) -> Candidate:
         return most_promising(self.belief, self.space, self.trials, candidates, self.seed)

@@ -19,7 +19,7 @@ from chargetune.learning.posterior import Posterior
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin import Twin
 
-__all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "windows_of"]
+__all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop", "believe", "episodes_of", "samples_of", "windows_of"]
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
 TRACES_MAX = 4
@@ -55,6 +55,10 @@ class TwinLoop(EnvelopeLoop, Protocol):
 
     def score(self, episode: Episode) -> Score | None:
         """The verdict on an episode; None when it has none."""
+        ...
+
+    def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        """By limit of the score the excess of every sample, in its unit, and the window of its profile that it counts in, 0 without one."""
         ...
 
     def violation(self, episode: Episode) -> float:
@@ -200,6 +204,20 @@ def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:
         windows = score.profile.get(name, (worst,))
         out += [np.nan if w is None else (w - share * tolerance) / (tolerance or 1.0) for w in windows]
     return np.array(out)
+
+
+def samples_of(
+    score: Score, samples: Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]], share: float = 1.0
+) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+    """The samples (`TwinLoop.samples`) that the windows of `windows_of` are the largest of, and the entry of each, shapes (n,)."""
+    values, windows, first = [np.zeros(0)], [np.zeros(0, dtype=int)], 0
+    for name in score.excess:
+        tolerance = score.tolerance.get(name, 0.0)
+        excess, window = samples[name]
+        values.append((excess - share * tolerance) / (tolerance or 1.0))
+        windows.append(window + first)
+        first += len(score.profile.get(name, (0.0,)))
+    return np.concatenate(values), np.concatenate(windows)
 
 
 def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:

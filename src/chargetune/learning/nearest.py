@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from chargetune.learning.belief import windows_of
-from chargetune.learning.twin_search import STEP, STUCK, Search
+from chargetune.learning.corner import STEP
+from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
 __all__ = ["nearest"]
@@ -19,7 +19,7 @@ GAIN = 1e-3
 ITERATIONS = 12
 # From afar SLSQP may end beside what is allowed: then a part of that way may do.
 PARTS = (0.8, 0.6, 0.4, 0.2)
-# Windows further inside their limits than so many tolerances say nothing.
+# Samples further inside their limits than so many tolerances say nothing.
 FAR = 1000.0
 # SLSQP ends a little on the wrong side: of a tolerance, and of the gain.
 ROUNDING = 0.1
@@ -30,6 +30,8 @@ UNIT = CLOSE / ROUNDING
 # An iteration that moves no entry by more than this is the last one once a point as near to it was kept: close to its goal the distance
 # is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, for as long as it may.
 SETTLED = 5e-3
+# Where no linear program holds, SLSQP takes back every step until little is left of it, time and again.
+STUCK = 5e-4
 
 
 def nearest(
@@ -43,23 +45,26 @@ def nearest(
     """The theta nearest to ``best``, the best trial's, that promises an objective of ``promised``, as ``start`` about does.
 
     min |u - u_best|^2 in the unit cube  s.t.  objective >= promised, less the share `GAIN` of its size, and
-    excess <= allowed in every window, in tolerances beyond the tolerance (`windows_of`), by SLSQP with finite differences.
+    excess <= allowed at every sample, by its window, in tolerances beyond the tolerance (`windows_of`), by SLSQP with finite differences.
 
     A change is a step into what has not been seen: entries that what is aimed at does not need stay where they were tried.
     ``search`` simulates the expected plant, so that ``allowed`` is to hold the margins. Where no point is found it is ``start``.
     """
     first, to = space.to_unit(start), space.to_unit(best)
-    if search.score(first) is None:
+    known = search.samples(first)
+    if known is None:
         return start
+    count = known[0].size
     worth = GAIN * abs(promised) or GAIN
     seen: dict[bytes, float] = {}
 
     def left(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is left to every window, in tolerances, and to the objective, in what a risk is worth."""
-        score = search.score(u)
-        if score is None:
-            return np.full(allowed.size + 1, -FAR)
-        room = np.nan_to_num(allowed - windows_of(score), nan=FAR)
+        """What is left to every sample, in tolerances, and to the objective, in what a risk is worth."""
+        score, samples = search.score(u), search.samples(u)
+        if score is None or samples is None or samples[0].size != count:
+            return np.full(count + 1, -FAR)
+        excess, window = samples
+        room = np.nan_to_num(allowed[window] - excess, nan=FAR)
         return np.append(np.clip(room, -FAR, FAR), (score.objective - promised) / worth + 1.0)
 
     def constraint(u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,7 +78,7 @@ def nearest(
         around = [u + step for step in np.diag(steps)]
         search.scores(around)
         values, beyond = left(u)[:, None], np.stack([left(ahead) for ahead in around], axis=1)
-        # A window that is entered or left by a step has no slope.
+        # A sample that enters or leaves a window that nothing is known of has no slope.
         return UNIT * np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
 
     way = [first]

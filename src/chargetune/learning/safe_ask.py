@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from chargetune.learning.ask import Ask
+from chargetune.learning.ask import WON, Ask
 from chargetune.learning.belief import episodes_of, windows_of
 from chargetune.learning.corrected import Candidate
 from chargetune.learning.envelope import covering
@@ -37,11 +37,13 @@ UNCHANGED, UNCHANGED_UNPROVED = 3e-3, 1e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
 # Beyond the quantile for these windows together: draws are few, and not Gaussian.
-BEYOND = 0.5
+BEYOND = 1.0
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
 # Factor on the deviations where they do not suffice.
 WIDER = 1.25
+# Searches, each with the margins of what the one before found.
+SEARCHES = 3
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
 NEARINGS = 3
 # Of the way to what is aimed at where that is not safe, the shares that are tried; the first that is safe is taken.
@@ -70,12 +72,7 @@ class SafeAsk(Ask):
         if not passed:
             return [self._tried()]
         if self.belief.proved:
-            found = self._furthest(passed[0][0], self.polished(passed[0], deviations))
-            ahead = [found]
-            if found is None or not self.as_good(found[0], begin):
-                # The rounds know nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
-                ahead.append(self._furthest(passed[0][0], self.polished(self.candidate(begin), deviations, kept=True)))
-            passed = [*(one for one in ahead if one is not None), *passed]
+            passed = [*self._searched(passed[0], deviations), *passed]
         best = self.most_promising(passed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
         others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
@@ -110,6 +107,21 @@ class SafeAsk(Ask):
             if passed and self.moved(before, theta) < SETTLED:
                 break
         return [one for _, one in sorted(passed, key=lambda one: -one[0])], deviations
+
+    def _searched(self, start: Candidate, deviations: float) -> list[Candidate]:
+        """From a candidate on, what is safe of searches that each hold the margins of the one before, the last one first."""
+        found: list[Candidate] = []
+        candidate = start
+        for _ in range(SEARCHES):
+            before, candidate = candidate, self.polished(candidate, deviations)
+            if self._safe(candidate):
+                found.insert(0, candidate)
+                if self.as_good(before[0], candidate[0], WON):
+                    break
+        if not found:
+            part = self._furthest(start[0], candidate)
+            found = [] if part is None else [part]
+        return found
 
     def _deviations(self, candidate: Candidate) -> float:
         """Standard deviations that keep each of n windows so surely that all are kept as stated: the quantile of p^(1/n) (Sidak).

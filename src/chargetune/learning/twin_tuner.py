@@ -136,7 +136,6 @@ class TwinTuner:
         return [space.to_unit(space.default), *sobol_points(space.dimension, self.seed, 0, self.pool), *known]
 
     def _searched(self, search: Search, first: list[NDArray[np.float64]]) -> Search:
-        search.scale(first)
         for start in (first[0], first[-1]):
             search.envelope(start, self.steps)
         search.refine(search.best(), self.iterations)
@@ -160,7 +159,7 @@ def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
             out.append(at)
     steps = [*out[STEPS_BACK - 1 :], *out[: STEPS_BACK - 1]]
     # An envelope step knows nothing of the objective, and may lead where the best theta, a little changed, does not: to a slow one.
-    ahead = [ask.polished(start, CAUTION[0], kept=True)]
+    ahead = [ask.polished(start, CAUTION[0])]
     if not (_likely(ahead) and ask.as_good(ahead[0][0], start[0])):
         ahead += [ask.polished(one, CAUTION[0]) for one in _likely(steps)[:1]]
     likely = _useful(_likely([*sorted(ahead, key=lambda one: _rank(one, 0.5), reverse=True), *steps]))

@@ -1,0 +1,122 @@
+"""Sequential linear programming: the best point within many limits at once, which is a corner of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+__all__ = ["Evaluate", "Point", "corner"]
+
+# Step of the finite differences.
+STEP = 2e-3
+# The first step is at most this long in any entry, every other one at most `LONGEST`; below `SHORTEST` there is none.
+RADIUS, LONGEST, SHORTEST = 0.1, 0.3, 1e-4
+# Of what a step promises the share that it has to hold, and those below and above which the next may be half or twice as long.
+HOLDS, POOR, GOOD = 0.1, 0.3, 0.75
+# A step that does not hold it is corrected so often, and then taken this much shorter.
+CORRECTIONS, SHORTER = 2, 0.25
+# Where a row stays broken for what mending it costs, it may cost this much more.
+DEARER = 10.0
+
+
+class Point(NamedTuple):
+    """What is to be minimised, and rows that are kept where they are at most 0."""
+
+    objective: float
+    rows: NDArray[np.float64]
+
+    @property
+    def violation(self) -> float:
+        return float(np.max(self.rows, initial=0.0))
+
+
+Evaluate = Callable[[Sequence[NDArray[np.float64]]], Sequence[Point | None]]
+"""Points of the unit cube -> what they are worth, None where that is not known."""
+
+
+def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain: float) -> NDArray[np.float64]:
+    """The best point of the unit cube that keeps all rows, from ``start``, which need not.
+
+        min f(u)  s.t.  c(u) <= 0,  0 <= u <= 1
+
+    by linear programs (HiGHS) with finite differences g, J, within a trust region,
+
+        min g'd + rho t  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
+
+    A step is taken when f + rho max(0, max c) falls as it says. When it does not it is corrected with what the rows were found to be
+    there, c(u + d) - J d, and then shortened. It ends after so many ``iterations``, or when a step promises less than the share
+    ``gain`` of f. A charge that rides its limits all the way has as many samples at a limit as theta has entries: its theta is a corner of
+    them, at which a linear program arrives like Newton's method.
+    Source: Fletcher and Sainz de la Maza, Math. Program. 43 (1989) 235; the correction: Nocedal and Wright, Numerical Optimization
+    (2006), section 15.6.
+    """
+    (here,) = evaluate([start])
+    if here is None:
+        return start
+    u, radius, price = start, RADIUS, abs(here.objective) or 1.0
+    for _ in range(iterations):
+        lines = _linearised(evaluate, u, here)
+        while True:
+            step, left = lines.step(radius, price)
+            promised = price * (here.violation - left) - float(lines.gradient @ step)
+            if promised < gain * abs(here.objective) or radius < SHORTEST:
+                return u
+            there, held = _held(evaluate, u, here, step, price)
+            for _ in range(CORRECTIONS):
+                if there is None or held >= HOLDS * promised:
+                    break
+                step, _ = lines.step(radius, price, there.rows - here.rows - lines.jacobian @ step)
+                there, held = _held(evaluate, u, here, step, price)
+            if there is not None and held >= HOLDS * promised:
+                break
+            radius *= SHORTER
+        if held < POOR * promised:
+            radius /= 2
+        elif held > GOOD * promised and np.max(np.abs(step)) > 0.9 * radius:
+            radius = min(2 * radius, LONGEST)
+        price *= DEARER if left > 0 and here.violation - left < HOLDS * here.violation else 1.0
+        u, here = u + step, there
+    return u
+
+
+def _held(evaluate: Evaluate, u: NDArray[np.float64], here: Point, step: NDArray[np.float64], price: float) -> tuple[Point | None, float]:
+    """What a step leads to, and by how much the merit falls."""
+    (there,) = evaluate([u + step])
+    if there is None or there.rows.shape != here.rows.shape:
+        return None, -np.inf
+    return there, here.objective - there.objective + price * (here.violation - there.violation)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Objective and rows around a point u, by their slopes there."""
+
+    u: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+    def step(self, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+        """The best step and the violation it leaves; ``bent``: by how much the rows are known to be above these lines."""
+        d = self.u.size
+        rows = self.rows + bent
+        near = rows + radius * np.abs(self.jacobian).sum(axis=1) > 0
+        matrix = np.hstack([self.jacobian[near], -np.ones((int(near.sum()), 1))])
+        bounds = [*zip(np.maximum(-radius, -self.u), np.minimum(radius, 1.0 - self.u), strict=True), (0.0, None)]
+        found = linprog(np.append(self.gradient, price), A_ub=matrix, b_ub=-rows[near], bounds=bounds, method="highs")
+        return (np.zeros(d), 0.0) if found.x is None else (found.x[:d], float(found.x[d]))
+
+
+def _linearised(evaluate: Evaluate, u: NDArray[np.float64], here: Point) -> _Lines:
+    steps = np.where(u + STEP <= 1.0, STEP, -STEP)
+    gradient, jacobian = np.zeros(u.size), np.zeros((here.rows.size, u.size))
+    for i, (step, ahead) in enumerate(zip(steps, evaluate([u + one for one in np.diag(steps)]), strict=True)):
+        if ahead is not None and ahead.rows.shape == here.rows.shape:
+            gradient[i] = (ahead.objective - here.objective) / step
+            jacobian[:, i] = (ahead.rows - here.rows) / step
+    return _Lines(u, here.rows, gradient, jacobian)
