@@ -6,9 +6,10 @@ A row is one method after one number of trials. Solved: the true, noise-free exc
 is at most 1 mV, any other limit kept within its tolerance, and its t95 within 1.05 of the attainable one. Recommended is the
 best that is believed to keep the limits by twin and composite (their `best`), the newest theta by safe and ilc, the best
 that kept the limits as measured by the others. Safe is told this tolerance, the others half of it.
-Attainable: the least t95 with at most 1 mV over the limit that envelope steps and SLSQP on the true plant find, computed here and
-kept in --cache; on a DFN plant envelope steps alone, and t80 stands for t95 in every key. Where no theta keeps the limit, nothing
-is solved. A safe learner that knows no safe theta stops. ask_s is wall time, for which --workers 1 leaves both cores to the learner.
+Attainable: the least t95 with at most 0.5 mV over the limit (1 mV where no theta has less) that envelope steps and the search on the
+true plant find, computed here and kept in --cache; on a DFN plant envelope steps alone, and t80 stands for t95 in every key. Where no
+theta keeps the limit, nothing is solved. A safe learner that knows no safe theta stops. ask_s is wall time, for which --workers 1
+leaves both cores to the learner.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ __all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
 # cover 90 % of it, on plants that the twin can be and on such as it cannot.
 SURE, SURE_UNPROVED = 0.84, 0.93
 # Of a limit's tolerance, what the upper side of the prediction may use after an envelope step.
-AIMED = 0.8
+AIMED = 0.6
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one,
@@ -37,7 +37,7 @@ UNCHANGED, UNCHANGED_UNPROVED = 3e-3, 1e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
 # Beyond the quantile for these windows together: draws are few, and not Gaussian.
-BEYOND = 1.0
+BEYOND = 0.5
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
 # Factor on the deviations where they do not suffice.
@@ -152,8 +152,9 @@ class SafeAsk(Ask):
         if score is None or not known:
             return theta
         margin = np.maximum(np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score)), 0.0)
-        # Where this one keeps less than the margin another may too, and nowhere else.
-        allowed = np.fmax(windows_of(score), -margin)
+        kept_back = np.nan_to_num(windows_of(score, AIMED) - windows_of(score))
+        # Where this one keeps less than margin and aim another may too, and nowhere else.
+        allowed = np.fmax(windows_of(score), -margin - kept_back)
         near = theta
         for _ in range(NEARINGS):
             near = nearest(search, self.space, known[0], near, score.objective, allowed)
@@ -162,7 +163,7 @@ class SafeAsk(Ask):
                 return near
             if expected is not None:
                 # It is less sure there, of some limits: those keep the margins of there.
-                allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)))
+                allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)) - kept_back)
         part = self._furthest(theta, there)
         return theta if part is None else part[0]
 
