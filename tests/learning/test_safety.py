@@ -181,7 +181,29 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
     aims = [ask.candidate(np.full(9, level)) for level in (1.6, 1.2, 1.0, 0.1)]
     assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
     found = [ask._furthest(theta, aim) for aim in aims]
-    assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, None]
+    assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, 1.9]
+    assert ask._furthest(np.full(9, 1.5), aims[-1]) is None
+
+
+def test_searches_lead_from_a_safe_theta_to_better_ones():
+    problem = charge(charge_time_to_soc=0.95, plant_model=TwoPairs(CELL))
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    trials, _, _ = learn(problem, tuner, 3)
+    ask = tuner._safe_ask(problem.space, trials, tuner.safety)
+    begin = ask.candidate(ask._expected_best())
+    deviations = ask._deviations(begin)
+    # The best theta on the expected plant breaks a limit on most plants; the searches begin at one far from it.
+    assert begin[1].probability() < 0.5
+    start = ask.candidate(np.array(trials[1].theta))
+    found = ask._searched(start, deviations)
+    assert found[-1] is start
+    assert all(predicted.probability() >= 0.95 for _, predicted in found)
+    objectives = [score.objective for score in ask.belief.scores([theta for theta, _ in found])]
+    assert objectives == sorted(objectives, reverse=True)
+    assert len(found) > 1
+    # What is kept back costs less than a tenth of the time of the best theta on the expected plant; where they began it cost a fifth.
+    best = ask.belief.scores([begin[0]])[0].objective
+    assert objectives[0] > 1.1 * best > 1.2 * best > objectives[-1]
 
 
 def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_does(monkeypatch):

@@ -26,7 +26,7 @@ __all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
 # cover 90 % of it, on plants that the twin can be and on such as it cannot.
 SURE, SURE_UNPROVED = 0.84, 0.93
 # Of a limit's tolerance, what the upper side of the prediction may use after an envelope step.
-AIMED = 0.6
+AIMED = 0.75
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one,
@@ -47,7 +47,7 @@ SEARCHES = 3
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
 NEARINGS = 3
 # Of the way to what is aimed at where that is not safe, the shares that are tried; the first that is safe is taken.
-PARTS = (0.8, 0.5)
+PARTS = (0.8, 0.5, 0.25)
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,13 @@ class SafeAsk(Ask):
             # Trials that left no trace have taught nothing.
             return [self._start()]
         self._check_budget()
-        begin = self._expected_best()
-        passed, deviations = self._rounds(begin)
+        begin = self.candidate(self._expected_best())
+        deviations = self._deviations(begin)
+        passed = self._rounds(begin, deviations)
         if not passed:
             return [self._tried()]
         if self.belief.proved:
-            passed = [*self._searched(passed[0], deviations), *passed]
+            passed = [*self._searched(passed[0], deviations), *passed[1:]]
         best = self.most_promising(passed)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
         others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
@@ -81,10 +82,9 @@ class SafeAsk(Ask):
     def _safe(self, candidate: Candidate) -> bool:
         return candidate[1].probability() >= self.safety.probability
 
-    def _rounds(self, theta: NDArray[np.float64]) -> tuple[list[Candidate], float]:
-        """From theta on, thetas that are safe enough, by the objective expected of them, and the sd that the last round kept back."""
-        candidate = self.candidate(theta)
-        deviations = self._deviations(candidate)
+    def _rounds(self, candidate: Candidate, deviations: float) -> list[Candidate]:
+        """From a candidate on, thetas that are safe enough, by the objective expected of them."""
+        theta = candidate[0]
         passed: list[tuple[float, Candidate]] = []
         unchanged = UNCHANGED if self.belief.proved else UNCHANGED_UNPROVED
         for k in range(ROUNDS):
@@ -106,27 +106,23 @@ class SafeAsk(Ask):
             theta, before = following if k < 1 else (theta + following) / 2, theta
             if passed and self.moved(before, theta) < SETTLED:
                 break
-        return [one for _, one in sorted(passed, key=lambda one: -one[0])], deviations
+        return [one for _, one in sorted(passed, key=lambda one: -one[0])]
 
     def _searched(self, start: Candidate, deviations: float) -> list[Candidate]:
-        """From a candidate on, what is safe of searches that each hold the margins of the one before, the last one first."""
-        found: list[Candidate] = []
-        candidate = start
+        """From a safe theta on the safe thetas that searches lead to, each with the margins of the one before, the last one first."""
+        found = [start]
         for _ in range(SEARCHES):
-            before, candidate = candidate, self.polished(candidate, deviations)
-            if self._safe(candidate):
-                found.insert(0, candidate)
-                if self.as_good(before[0], candidate[0], WON):
-                    break
-        if not found:
-            part = self._furthest(start[0], candidate)
-            found = [] if part is None else [part]
+            before = found[0]
+            ahead = self._furthest(before[0], self.polished(before, deviations))
+            if ahead is None or self.as_good(before[0], ahead[0], WON):
+                break
+            found.insert(0, ahead)
         return found
 
     def _deviations(self, candidate: Candidate) -> float:
         """Standard deviations that keep each of n windows so surely that all are kept as stated: the quantile of p^(1/n) (Sidak).
 
-        n: how many the candidate may break.
+        n: how many the candidate may break; that of the best theta on the expected plant, which is at all that it may come to.
         """
         near = int(np.sum(candidate[1].upper_windows(NEAR) > 0))
         together = float(norm.ppf(self.safety.probability ** (1 / max(near, 1))))
