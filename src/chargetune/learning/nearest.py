@@ -17,6 +17,8 @@ __all__ = ["nearest"]
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
 ITERATIONS = 12
+# Beyond where it starts and where it is to be near it looks no further than this: SLSQP has no trust region, and left for good.
+ASIDE = 0.1
 # From afar SLSQP may end beside what is allowed: then a part of that way may do.
 PARTS = (0.8, 0.6, 0.4, 0.2)
 # Samples further inside their limits than so many tolerances say nothing.
@@ -27,9 +29,9 @@ ROUNDING = 0.1
 # in tolerances it went on for a thousandth of one, four times as long.
 CLOSE = 1e-5
 UNIT = CLOSE / ROUNDING
-# An iteration that moves no entry by more than this is the last one once a point as near to it was kept: close to its goal the distance
-# is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, for as long as it may.
-SETTLED = 5e-3
+# Two iterations that come nearer by less than this share of the first distance, squared, are the last ones after others won more: close to
+# its goal the distance is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, as long as it may.
+NEARER = 0.01
 # Where no linear program holds, SLSQP takes back every step until little is left of it, time and again.
 STUCK = 5e-4
 
@@ -81,12 +83,13 @@ def nearest(
         # A sample that enters or leaves a window that nothing is known of has no slope.
         return UNIT * np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
 
-    way = [first]
+    way, nearer = [first], [float(np.sum((first - to) ** 2))]
 
     def follow(u: NDArray[np.float64]) -> None:
         way.append(np.array(u))
-        moved = float(np.max(np.abs(way[-1] - way[-2])))
-        if moved < STUCK or (moved < SETTLED and any(np.max(np.abs(np.frombuffer(key) - u)) < SETTLED for key in seen)):
+        nearer.append(min(seen.values(), default=np.inf))
+        before, worth = nearer[-3:][0], NEARER * nearer[0]
+        if np.max(np.abs(way[-1] - way[-2])) < STUCK or nearer[0] - before >= worth > before - nearer[-1]:
             raise StopIteration
 
     # Older SciPy lets it through, newer ends there.
@@ -96,7 +99,7 @@ def nearest(
             first,
             jac=lambda u: u - to,
             method="SLSQP",
-            bounds=[(0.0, 1.0)] * first.size,
+            bounds=[(max(0.0, low - ASIDE), min(1.0, high + ASIDE)) for low, high in np.sort([first, to], axis=0).T],
             constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
             options={"maxiter": ITERATIONS, "ftol": CLOSE},
             callback=follow,

@@ -109,14 +109,19 @@ class SafeAsk(Ask):
         return [one for _, one in sorted(passed, key=lambda one: -one[0])]
 
     def _searched(self, start: Candidate, deviations: float) -> list[Candidate]:
-        """From a safe theta on the safe thetas that searches lead to, each with the margins of the one before, the last one first."""
+        """From a safe theta on the safe thetas that searches lead to, the last one first: each with the margins of the one before.
+
+        Another one follows where a part of the way was gone, because all of it is not safe, and the rest of it is worth one.
+        """
         found = [start]
         for _ in range(SEARCHES):
-            before = found[0]
-            ahead = self._furthest(before[0], self.polished(before, deviations))
-            if ahead is None or self.as_good(before[0], ahead[0], WON):
+            aim = self.polished(found[0], deviations)
+            ahead = self._furthest(found[0][0], aim)
+            if ahead is None or self.as_good(found[0][0], ahead[0], WON):
                 break
             found.insert(0, ahead)
+            if self.as_good(ahead[0], aim[0]):
+                break
         return found
 
     def _deviations(self, candidate: Candidate) -> float:
