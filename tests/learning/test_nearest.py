@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chargetune.episode.score import Score
-from chargetune.learning.nearest import GAIN, nearest
+from chargetune.learning.nearest import ASIDE, GAIN, nearest
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import Parameter, ParameterSpace
 
@@ -51,12 +51,12 @@ def test_a_theta_that_promises_no_more_is_not_worth_a_step():
     np.testing.assert_allclose(found, best, rtol=0, atol=1e-9)
 
 
-def test_it_ends_where_it_is_not_left_to_run_back_and_forth():
-    # Eleven windows, each with its own bent limit, u_i + 3 (u_i+1 - 0.5)^2 <= 0.5, and a best theta beyond all: the nearest has all at 0.5.
+def bent_search():
+    """Eleven windows, each with its own bent limit, u_i + 3 (u_(i+1) - 0.5)^2 <= 0.5: (search, its space, points simulated so far)."""
     space, simulated = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5, size=11),)), []
 
     def simulate(thetas):
-        simulated.extend(thetas)
+        simulated.extend(space.to_unit(theta) for theta in thetas)
         return [space.to_unit(theta) for theta in thetas]
 
     def bent(u):
@@ -69,16 +69,27 @@ def test_it_ends_where_it_is_not_left_to_run_back_and_forth():
         windows = bent(u)
         return Score(float(u.sum()), float(u.sum()), {"limit": windows.max()}, {"limit": 1e-3}, profile={"limit": tuple(windows)})
 
+    return Search(SimpleNamespace(score=score, samples=samples), simulate, space), space, simulated
+
+
+def test_it_ends_where_it_is_not_left_to_run_back_and_forth():
+    # The best theta is beyond all limits: the nearest has all entries at 0.5.
+    found_by, space, simulated = bent_search()
     start = np.random.default_rng(0).uniform(0.1, 0.4, 11)
-    found = nearest(
-        Search(SimpleNamespace(score=score, samples=samples), simulate, space),
-        space,
-        np.full(11, 0.6),
-        start,
-        start.sum(),
-        np.full(11, -1.0),
-    )
+    found = nearest(found_by, space, np.full(11, 0.6), start, start.sum(), np.full(11, -1.0))
     # A tenth of the tolerance is rounding.
     np.testing.assert_allclose(found, 0.5, rtol=0, atol=1e-3)
     # Four times as many when SLSQP ends by itself, after as many iterations as it may take.
     assert len(simulated) < 100
+
+
+def test_it_looks_no_further_aside_than_between_where_it_starts_and_what_it_is_to_be_near():
+    found_by, space, simulated = bent_search()
+    draw = np.random.default_rng(6)
+    start, best = draw.uniform(0.0, 0.45, 11), draw.uniform(0.3, 1.0, 11)
+    found = nearest(found_by, space, best, start, 0.5 * start.sum(), np.full(11, -1.0))
+    low, high = np.minimum(start, best) - ASIDE, np.maximum(start, best) + ASIDE
+    # Left to itself SLSQP goes 0.25 aside, and takes 115 points to come as near.
+    assert np.all((np.array(simulated) >= low - 0.01) & (np.array(simulated) <= high + 0.01))
+    assert len(simulated) < 100
+    assert np.sum((found - best) ** 2) < 0.95 < np.sum((start - best) ** 2)
