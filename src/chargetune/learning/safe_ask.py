@@ -74,10 +74,10 @@ class SafeAsk(Ask):
             return [self._tried()]
         if self.belief.proved:
             passed = [*self._searched(passed[0], deviations), *passed[1:]]
-        best = self.most_promising(passed)
+        first = self._nearer(self.most_promising(passed), deviations)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
-        others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, best[0])]
-        return [self._nearer(best, deviations), *others]
+        others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, first)]
+        return [first, *others]
 
     def _safe(self, candidate: Candidate) -> bool:
         return candidate[1].probability() >= self.safety.probability
