@@ -21,12 +21,12 @@ __all__ = ["Ask"]
 # Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has foretold a trial:
 # its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
 DRAWS, DRAWS_UNPROVED = 32, 64
-# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step; a search has its own aim. The rest is for
-# what the few standard deviations that are taken back without a promise do not hold.
+# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step and a search. The rest is for what the few
+# standard deviations that are taken back without a promise do not hold.
 AIMED = 0.5
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
-# Of the objective, what an iteration of it has to win that another one follows.
+# Of the objective, what an iteration of it has to promise, and it in all.
 WON = 1e-3
 # Of the objective, what another search would have to win.
 WORTH = 0.01

@@ -25,7 +25,7 @@ __all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
 # quantiles, the fewer there are the more is left to allow for. Before a trial was foretold: so that 90 % intervals of the second one
 # cover 90 % of it, on plants that the twin can be and on such as it cannot.
 SURE, SURE_UNPROVED = 0.84, 0.93
-# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step.
+# Of a limit's tolerance, what the upper side of the prediction may use after envelope steps, searches, and the one for the nearest theta.
 AIMED = 0.75
 # Envelope steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7

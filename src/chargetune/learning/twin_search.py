@@ -50,10 +50,10 @@ class Search:
     def score(self, u: NDArray[np.float64]) -> Score | None:
         return self.scores([u])[0]
 
-    def samples(self, u: NDArray[np.float64], share: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.int_]] | None:
+    def samples(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int_]] | None:
         """The samples at u that `windows_of` are the largest of, and the window of each (`samples_of`); None without a verdict."""
         seen = self._at(u)
-        return None if seen is None else samples_of(seen.score, seen.samples, share)
+        return None if seen is None else samples_of(seen.score, seen.samples)
 
     def scores(self, points: Sequence[NDArray[np.float64]]) -> list[Score | None]:
         """Verdicts at several points, simulated together."""
