@@ -117,8 +117,9 @@ def control_problem(controller: Controller) -> Problem:
         ca.SX(corrected),
         ca.SX(controller.estimator.predict(model, x, memory, u, p)),
     ]
-    # Everything that depends on theta and p alone is computed once an episode instead of at every stage.
-    found = ca.extract_parametric(expressions, ca.vertcat(theta, setpoint, nominal), {"extract_trivial": True})
+    # Everything that depends on theta and p alone is computed once an episode instead of at every stage. What two of these expressions
+    # share has to be one beforehand: two symbols for one number are not recognised any more.
+    found = ca.extract_parametric(_cse(*expressions), ca.vertcat(theta, setpoint, nominal), {"extract_trivial": True})
     expressions, symbols, values = found
     q = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
     prepared = ca.cse(ca.vertcat(*values)) if values else ca.SX(0, 1)

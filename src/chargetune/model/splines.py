@@ -1,12 +1,15 @@
 """Cubic tables whose node values may be numbers or CasADi parameters.
 
-Both kinds are written as truncated powers,
+Both kinds are sums of truncated powers,
 
     s(z) = a + b (z - z_0) + sum_j e_j max(0, z - z_j)^2 + d_j max(0, z - z_j)^3,
 
 so that there is no interval search: the expression differentiates, compiles and stays defined outside the nodes, where
 it goes on as a straight line. For the natural spline a, b, d are linear in the node values (e = 0), which lets theta
 be a node value at run time. The monotone PCHIP slopes are not linear in the values, so PCHIP takes numbers only.
+
+The powers are multiplied out: what the nodes below z add to the four coefficients of one cubic in z - z_0 is summed first.
+These sums are constant between nodes, so a derivative costs a few operations a table instead of a few a node.
 """
 
 from __future__ import annotations
@@ -43,11 +46,11 @@ def natural_spline(z: Any, nodes: ArrayLike, values: Any) -> Any:
     if column.shape != (grid.size, 1):
         raise ValueError(f"spline values have shape {column.shape}, expected ({grid.size}, 1), one a node")
     coefficients = ca.mtimes(ca.DM(natural_spline_matrix(grid)), column)
-    out = coefficients[0] + coefficients[1] * (z - grid[0])
+    cubic = [coefficients[0], coefficients[1], 0.0, 0.0]
     for j, node in enumerate(grid):
-        t = _positive_part(z - node)
-        out += coefficients[2 + j] * (t * t * t)
-    return out
+        step = _beyond(z, node) * coefficients[2 + j]
+        cubic = [c + k * step if k else c for c, k in zip(cubic, _about(node - grid[0], 0.0, 1.0), strict=True)]
+    return _horner(z - grid[0], cubic)
 
 
 def piecewise_linear(z: Any, nodes: ArrayLike, values: Any) -> Any:
@@ -80,15 +83,29 @@ def pchip(z: Any, nodes: ArrayLike, values: ArrayLike) -> Any:
     slope = interpolant.derivative()(grid)
     curve = np.append(interpolant.c[1], 0.0)
     cubic = np.append(interpolant.c[0], 0.0)
-    out = table[0] + slope[0] * (z - grid[0])
     width = np.append(np.nan, np.diff(grid))
+    out: list[Any] = [table[0], slope[0], 0.0, 0.0]
     for j, node in enumerate(grid):
-        t = _positive_part(z - node)
         # Coefficients of this piece less those of the piece before, both written about this node.
         square = curve[j] - (curve[j - 1] + 3 * cubic[j - 1] * width[j] if j else 0.0)
         cube = cubic[j] - (cubic[j - 1] if j else 0.0)
-        out += (square + cube * t) * (t * t)
-    return out
+        beyond = _beyond(z, node)
+        out = [c + k * beyond if k else c for c, k in zip(out, _about(node - grid[0], square, cube), strict=True)]
+    return _horner(z - grid[0], out)
+
+
+def _about(t: float, square: float, cube: float) -> tuple[float, float, float, float]:
+    """The coefficients 1, x, x^2, x^3 of square (x - t)^2 + cube (x - t)^3."""
+    return square * t**2 - cube * t**3, 3 * cube * t**2 - 2 * square * t, square - 3 * cube * t, cube
+
+
+def _horner(x: Any, c: list[Any]) -> Any:
+    return c[0] + x * (c[1] + x * (c[2] + x * c[3]))
+
+
+def _beyond(z: Any, node: float) -> Any:
+    # As a factor: CasADi moves an if_else out of every product, and the machine code would branch at each derivative of each node.
+    return z > node
 
 
 def _positive_part(t: Any) -> Any:
