@@ -115,3 +115,16 @@ def test_every_point_is_within_the_cube():
     found = corner(problem, np.array([0.95, 0.2, 1.0]), 30, 1e-6)
     np.testing.assert_allclose(found, 1.0, rtol=0, atol=1e-9)
     assert np.all(np.abs(np.array(problem.points) - 0.5) <= 0.5 + 1e-9)
+
+
+def test_what_is_broken_by_no_more_than_counts_as_kept_is_no_reason_to_go_on():
+    # Every straight step ends on the wrong side of this limit, and there is nothing but the limit to gain.
+    def limits(u):
+        return np.array([u[0] ** 2 - 0.01, -1.0])
+
+    whole, short = (Counted(lambda u: 1.0, limits) for _ in range(2))
+    start = np.array([0.9, 0.5])
+    most, enough = corner(whole, start, 60, 1e-6), corner(short, start, 60, 1e-6, kept=0.2)
+    assert limits(most)[0] <= 1e-5
+    assert 0.01 < limits(enough)[0] <= 0.2
+    assert len(short.points) < len(whole.points)

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -72,18 +72,20 @@ class CompiledEpisode:
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
-        # An ensemble has few thetas: what depends on theta alone is computed once for each.
+        # An ensemble has few thetas, slopes have few plants: what depends on one of them alone is computed once for each.
         of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
+        of_plant: dict[int, _OfPlant] = {}
         given, unknown = [], []
         for theta, plant, table in zip(thetas, plants, tables, strict=True):
-            check_run(plant, self.steps, seed, ())
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
                 of_theta[key] = self._of_theta(values)
-            known, unforeseen = self._with_plant(of_theta[key], plant, seed, table)
-            given.append(known)
-            unknown.append(unforeseen)
+            if id(plant) not in of_plant:
+                check_run(plant, self.steps, seed, ())
+                of_plant[id(plant)] = self._of_plant(plant, seed)
+            given.append(self._given(of_theta[key], of_plant[id(plant)], table))
+            unknown.append(of_plant[id(plant)].unknown)
         evaluated = partial(_evaluated, self.function, (self.steps, sum(self.widths)))
         # The loops alone go into threads, as machine code: all else waits for the interpreter.
         recorded = each(evaluated, given, unknown) if self.compiled and len(plants) > 1 else list(map(evaluated, given, unknown))
@@ -94,7 +96,8 @@ class CompiledEpisode:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What is given once an episode, shape (n,), and once an interval, shape (steps, m)."""
         check_run(plant, self.steps, seed, trips)
-        return self._with_plant(self._of_theta(self.controller.theta_vector(theta)), plant, seed)
+        of_plant = self._of_plant(plant, seed)
+        return self._given(self._of_theta(self.controller.theta_vector(theta)), of_plant), of_plant.unknown
 
     def _of_theta(self, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """The controller's memory at the start, and its numbers."""
@@ -102,19 +105,23 @@ class CompiledEpisode:
         q = problem_of(self.controller).prepare(values, self.controller.setpoint, self.controller.model.nominal)
         return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
 
-    def _with_plant(
-        self, of_theta: Sequence[NDArray[np.float64]], plant: SimulatedPlant, seed: int, table: NDArray[np.float64] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _of_plant(self, plant: SimulatedPlant, seed: int) -> _OfPlant:
         errors, process = disturbances(plant, self.steps, seed)
         _, _, resolution = plant.sensors.vectors(plant.outputs)
-        plant_q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
-        given = [plant.start_state, *of_theta, plant_q, resolution]
+        q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
+        unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
+        return _OfPlant(plant.start_state, np.concatenate([q, resolution]), errors[0, 1], unknown)
+
+    def _given(
+        self, of_theta: Sequence[NDArray[np.float64]], of_plant: _OfPlant, table: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        given = [of_plant.start, *of_theta, of_plant.numbers]
         if self.lattice is not None:
             nothing = np.zeros((len(self.lattice.outputs), self.lattice.size))
             given.append(self.lattice.coefficients(nothing if table is None else table))
         elif table is not None:
             raise ValueError("a table was given, allowed is none: these episodes were built without a lattice")
-        return np.concatenate([*given, errors[0, 1]]), np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
+        return np.concatenate([*given, of_plant.at_rest])
 
     def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
         controller, start_state = self.controller, plant.start_state
@@ -141,6 +148,15 @@ class CompiledEpisode:
         )
         at_rest = tripped(plant, replace(plant).reset(seed), trips) if trips else ""
         return episode.cut(0, Ending.LIMIT, at_rest) if at_rest else _until_not_finite(episode, trips)
+
+
+class _OfPlant(NamedTuple):
+    """What an episode needs of its plant: state at the start, parameters and resolution, sensor error at rest, what no one foresees."""
+
+    start: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    at_rest: NDArray[np.float64]
+    unknown: NDArray[np.float64]
 
 
 def _evaluated(

@@ -27,7 +27,7 @@ AIMED = 0.5
 # Iterations of the search that follows the envelope steps.
 POLISHING = 8
 # Of the objective, what an iteration of it has to promise, and it in all.
-WON = 1e-3
+WON = 2e-3
 # Of the objective, what another search would have to win.
 WORTH = 0.01
 

@@ -39,7 +39,7 @@ Evaluate = Callable[[Sequence[NDArray[np.float64]]], Sequence[Point | None]]
 """Points of the unit cube -> what they are worth, None where that is not known."""
 
 
-def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain: float) -> NDArray[np.float64]:
+def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain: float, kept: float = 0.0) -> NDArray[np.float64]:
     """The best point of the unit cube that keeps all rows, from ``start``, which need not.
 
         min f(u)  s.t.  c(u) <= 0,  0 <= u <= 1
@@ -50,8 +50,9 @@ def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain
 
     A step is taken when f + rho max(0, max c) falls as it says. When it does not it is corrected with what the rows were found to be
     there, c(u + d) - J d, and then shortened. It ends after so many ``iterations``, or when a step promises less than the share
-    ``gain`` of f. A charge that rides its limits all the way has as many samples at a limit as theta has entries: its theta is a corner of
-    them, at which a linear program arrives like Newton's method.
+    ``gain`` of f; that it mends rows does not count where none is broken by more than ``kept``. A charge that rides its limits all
+    the way has as many samples at a limit as theta has entries: its theta is a corner of them, at which a linear program arrives like
+    Newton's method.
     Source: Fletcher and Sainz de la Maza, Math. Program. 43 (1989) 235; the correction: Nocedal and Wright, Numerical Optimization
     (2006), section 15.6.
     """
@@ -64,7 +65,8 @@ def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain
         while True:
             step, left = lines.step(radius, price)
             promised = price * (here.violation - left) - float(lines.gradient @ step)
-            if promised < gain * abs(here.objective) or radius < SHORTEST:
+            mended = price * (here.violation - left) if here.violation <= kept else 0.0
+            if promised - mended < gain * abs(here.objective) or radius < SHORTEST:
                 return u
             there, held = _held(evaluate, u, here, step, price)
             for _ in range(CORRECTIONS):

@@ -18,6 +18,7 @@ from chargetune.control.mpc import cached
 from chargetune.episode.episode import Episode
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameters import ParameterSpace
+from chargetune.model.parametric import parametric
 
 __all__ = ["Envelope", "EnvelopeLoop", "covering", "predicted_rows"]
 
@@ -117,7 +118,7 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     apply at that end.
     """
     memory = controller.estimator.initial(controller.model, np.array(controller.start))
-    step = cached(f"rows {controller.structure}", lambda: _step(controller))
+    step, of_fixed = cached(f"rows {controller.structure}", lambda: _step(controller))
     names = controller.estimator.signals(controller.model)
     received = np.full((len(episode), len(names)), np.nan)
     for i, name in enumerate(names):
@@ -129,8 +130,8 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
     d, count = len(theta), len(episode)
     roll = cached(f"rolled rows {controller.structure} {count}", lambda: step.mapaccum("rolled", count, 2))
-    fixed = [np.tile(np.asarray(v)[:, None], (1, count)) for v in (theta, controller.model.nominal)]
-    _, _, rows, slopes = roll(memory, np.zeros((memory.size, d)), received.T, last.T, episode.input.T, *fixed)
+    q = ca.repmat(of_fixed(theta, controller.model.nominal), 1, count)
+    _, _, rows, slopes = roll(memory, np.zeros((memory.size, d)), received.T, last.T, episode.input.T, q)
     width = rows.shape[0] // 2
     return np.array(rows).T.reshape(count, 2, width), np.array(slopes).T.reshape(count, d, 2, width).transpose(0, 2, 3, 1)
 
@@ -226,8 +227,8 @@ def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float6
     return np.asarray(np.all((episode.input >= upper - room) | (episode.input <= lower + room), axis=1))
 
 
-def _step(controller: Controller) -> ca.Function:
-    """(memory, its slopes, received, last input, input, theta, p) -> (memory, its slopes, rows, their slopes) one interval ahead."""
+def _step(controller: Controller) -> tuple[ca.Function, ca.Function]:
+    """(memory, its slopes, received, last input, input, q) -> (memory, its slopes, rows, theirs) an interval ahead; (theta, p) -> q."""
     model, estimator = controller.model, controller.estimator
     names = estimator.signals(model)
     nm, d = estimator.initial(model, np.array(controller.start)).size, controller.theta.dimension
@@ -250,8 +251,5 @@ def _step(controller: Controller) -> ca.Function:
     def total(value: Any) -> Any:
         return ca.densify(ca.jacobian(value, theta) + ca.mtimes(ca.jacobian(value, memory), slopes))
 
-    return ca.Function(
-        "rows",
-        [memory, slopes, received, last, u, theta, nominal],
-        ca.cse([ca.densify(ahead), total(ahead), ca.densify(every), ca.vec(total(every))]),
-    )
+    arguments = [memory, slopes, received, last, u]
+    return parametric("rows", arguments, [theta, nominal], [ahead, total(ahead), every, ca.vec(total(every))])

@@ -81,7 +81,8 @@ class Posterior:
         """The mode and a Gaussian draw of the difference from it -> the unknowns that predict what they should (`draw`)."""
         for fresh in (False, True, True):
             m = self.mode + draw
-            misfit, pull = self._misfit(m, draw)
+            wanted = [values + slopes @ draw for values, slopes, _ in self._at_mode]
+            misfit, pull = self._misfit(m, draw, wanted)
             if not np.isfinite(misfit):
                 draw = draw * 0.5
                 continue
@@ -96,7 +97,7 @@ class Posterior:
                 shares = (1.0, 0.5, 0.25) if fresh else (1.0,)
                 for share in shares:
                     ahead = m - share * step
-                    other, following = self._misfit(ahead, draw)
+                    other, following = self._misfit(ahead, draw, wanted)
                     if other < misfit:
                         break
                 else:
@@ -111,34 +112,41 @@ class Posterior:
         return self.mode + draw
 
     @cached_property
-    def _at_mode(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        return [(self.twin.predict(self.mode, u), self.twin.slopes(self.mode, u)) for u, _ in self.seen]
+    def _at_mode(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+        """Of each episode the outputs at the mode and their slopes, shapes (n,) and (n, d), and the weights, in sd; 0 where not seen."""
+        out = []
+        for u, seen in self.seen:
+            weight = np.where(seen, 1.0 / self.spread, 0.0).ravel()
+            slopes = self.twin.slopes(self.mode, u).reshape(-1, self.mode.size)
+            out.append((weight * self.twin.predict(self.mode, u).ravel(), weight[:, None] * slopes, weight))
+        return out
 
     @cached_property
     def _precision(self) -> NDArray[np.float64]:
         return np.asarray(np.linalg.inv(self.twin.prior_factor @ self.twin.prior_factor.T))
 
-    def _misfit(self, m: NDArray[np.float64], draw: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """What `draw` minimises at m, and half its gradient with the slopes of the mode."""
+    def _misfit(
+        self, m: NDArray[np.float64], draw: NDArray[np.float64], wanted: list[NDArray[np.float64]]
+    ) -> tuple[float, NDArray[np.float64]]:
+        """What `draw` minimises at m, and half its gradient with the slopes of the mode; ``wanted``: what it should predict, in sd."""
         away = m - self.mode - draw
         pull = self._precision @ away
         total = float(away @ pull)
-        for (u, seen), (values, slopes) in zip(self.seen, self._at_mode, strict=True):
+        for (u, _), (_, slopes, weight), target in zip(self.seen, self._at_mode, wanted, strict=True):
             # A long step may lead where outputs are not finite: their misfit is nan, which is smaller than none, and it is not taken.
             with np.errstate(invalid="ignore", over="ignore"):
-                left = np.where(seen, self.twin.predict(m, u) - values - slopes @ draw, 0.0) / self.spread
-                total += float(np.sum(left**2))
-                pull = pull + (left / self.spread).ravel() @ slopes.reshape(-1, draw.size)
+                left = weight * self.twin.predict(m, u).ravel() - target
+                total += float(left @ left)
+                pull = pull + left @ slopes
         return total, pull
 
     def _curvature(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
         """J'J of the whitened residuals at m, in the metric of the slopes that `_misfit` pulls with."""
         total = self._precision.copy()
-        for (u, seen), (_, at_mode) in zip(self.seen, self._at_mode, strict=True):
-            weight = np.where(seen, 1.0, 0.0) / self.spread**2
+        for (u, _), (_, slopes, weight) in zip(self.seen, self._at_mode, strict=True):
             own = self.twin.slopes(m, u).reshape(-1, m.size)
             with np.errstate(invalid="ignore", over="ignore"):
-                total += (at_mode.reshape(-1, m.size) * weight.reshape(-1, 1)).T @ own
+                total += (weight[:, None] * slopes).T @ own
         return total
 
     def predicted_sd(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ from chargetune.episode.episode import Episode
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.sections import sections
 from chargetune.model.model import Model
+from chargetune.model.parametric import parametric
 
 if TYPE_CHECKING:
     from chargetune.learning.discrepancy import Discrepancy, Foretold
@@ -231,7 +232,13 @@ class _Misfit:
     """
 
     def __init__(self, twin: Twin, data: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]) -> None:
-        self._twin, self._data, self._spread = twin, data, spread
+        self._twin, self._inputs = twin, [u for u, _ in data]
+        # Of every sample its weight, 0 where none was measured, and what was measured times that.
+        self._weights = [np.where(np.isfinite(y), 1.0 / spread, 0.0).ravel() for _, y in data]
+        self._wanted = [weight * np.nan_to_num(y.ravel()) for (_, y), weight in zip(data, self._weights, strict=True)]
+        d = len(twin.prior_factor)
+        self._whitened = np.eye(d + 1)
+        self._whitened[:d, :d] = twin.prior_factor
         self._at, self._triangle = np.zeros(0), np.zeros((0, 0))
 
     def values(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -245,32 +252,33 @@ class _Misfit:
     def _known(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
         if not np.array_equal(e, self._at):
             own = np.hstack([np.eye(len(e)), e[:, None]])
-            squares = each(self._square, [e] * len(self._data), self._data)
+            squares = each(self._square, [e] * len(self._inputs), self._inputs, self._weights, self._wanted)
             total = sum(squares, start=own.T @ own)
             # Where the data fit to the last digit nothing is left of the last pivot but rounding.
             total[-1, -1] += np.finfo(float).eps * (1.0 + np.trace(total))
             self._at, self._triangle = e.copy(), np.linalg.cholesky(total).T
         return self._triangle
 
-    def _square(self, e: NDArray[np.float64], trace: tuple[NDArray[np.float64], NDArray[np.float64]]) -> NDArray[np.float64]:
-        twin, (u, y) = self._twin, trace
+    def _square(
+        self, e: NDArray[np.float64], inputs: NDArray[np.float64], weight: NDArray[np.float64], wanted: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        twin, d = self._twin, len(e)
         m = twin.prior_factor @ e
-        left = np.nan_to_num((twin.predict(m, u) - y) / self._spread, nan=0.0)
-        slopes = np.where(np.isfinite(y)[..., None], twin.slopes(m, u), 0.0) / self._spread[:, None]
-        both = np.hstack([slopes.reshape(-1, len(e)) @ twin.prior_factor, left.reshape(-1, 1)])
-        return np.asarray(both.T @ both)
+        both = np.empty((len(weight), d + 1))
+        np.multiply(weight[:, None], twin.slopes(m, inputs).reshape(-1, d), out=both[:, :d])
+        np.subtract(weight * twin.predict(m, inputs).ravel(), wanted, out=both[:, d])
+        return np.asarray(self._whitened.T @ (both.T @ both) @ self._whitened)
 
 
 def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Means over `BLOCKS` stretches, of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= BLOCKS, n)."""
-    means, counts = [], []
-    for part in np.array_split(values, min(BLOCKS, len(values))):
-        seen = np.isfinite(part)
-        count = seen.sum(axis=(0, 1))
-        total = np.where(seen, part, 0.0).sum(axis=(0, 1))
-        means.append(np.where(count > 0, total / np.maximum(count, 1), np.nan))
-        counts.append(count)
-    return np.array(means), np.array(counts, dtype=np.float64)
+    parts = min(BLOCKS, len(values))
+    sizes = np.full(parts, len(values) // parts) + (np.arange(parts) < len(values) % parts)
+    starts = np.cumsum(sizes) - sizes
+    seen = np.isfinite(values)
+    counts = np.add.reduceat(seen.sum(axis=1), starts, axis=0).astype(np.float64)
+    totals = np.add.reduceat(np.where(seen, values, 0.0).sum(axis=1), starts, axis=0)
+    return np.where(counts > 0, totals / np.maximum(counts, 1.0), np.nan), counts
 
 
 def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -368,18 +376,17 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     slope_end = ca.mtimes(ca.jacobian(end, at), ahead) + ca.jacobian(end, m)
     end, slope_end = (ca.substitute([e], [at], [after])[0] for e in (end, slope_end))
     fixed = [m, nominal, begin]
-    plain = ca.Function("plain", [x, u, *fixed], ca.cse([after, ca.vertcat(start, end)]))
     # Row by row, so that the result reshapes to (interval, end, output, unknown).
     slopes = ca.vec(ca.vertcat(slope_start, slope_end).T)
-    with_slopes = ca.Function("with_slopes", [x, sensitivity, u, *fixed], ca.cse([ca.densify(e) for e in (after, ahead, slopes)]))
+    plain, of_plain = parametric("plain", [x, u], fixed, [after, ca.vertcat(start, end)])
+    with_slopes, of_slopes = parametric("with_slopes", [x, sensitivity, u], fixed, [after, ahead, slopes])
 
     inputs = ca.MX.sym("inputs", nu, count)
     given = [ca.MX.sym(name, e.shape[0]) for name, e in zip(("m", "nominal", "begin"), fixed, strict=True)]
     at_start = ca.Function("at_start", fixed, [x0, ca.densify(ca.jacobian(x0, m))])
     state, first = at_start(*given)
-    every = [ca.repmat(e, 1, count) for e in given]
-    _, seen = plain.mapaccum("values", count)(state, inputs, *every)
-    _, _, steep = with_slopes.mapaccum("slopes", count, 2)(state, first, inputs, *every)
+    _, seen = plain.mapaccum("values", count)(state, inputs, ca.repmat(of_plain(*given), 1, count))
+    _, _, steep = with_slopes.mapaccum("slopes", count, 2)(state, first, inputs, ca.repmat(of_slopes(*given), 1, count))
     simulate = ca.Function("simulate", [*given, inputs], [seen])
     sloped = ca.Function("sloped", [*given, inputs], [steep])
     if find_compiler() is None:

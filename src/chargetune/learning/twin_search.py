@@ -84,7 +84,7 @@ class Search:
         Its rows are the samples, not the windows of the verdict: the largest of many that all ride their limit has a kink wherever
         another one becomes it, and what is linear about a kink leads nowhere.
         """
-        corner(self._points, start, iterations, gain)
+        corner(self._points, start, iterations, gain, ROUNDING)
 
     def _points(self, points: Sequence[NDArray[np.float64]]) -> list[Point | None]:
         self.scores(points)
