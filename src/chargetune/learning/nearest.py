@@ -32,6 +32,8 @@ UNIT = CLOSE / ROUNDING
 # Two iterations that come nearer by less than this share of the first distance, squared, are the last ones after others won more: close to
 # its goal the distance is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, as long as it may.
 NEARER = 0.01
+# Below this share of it there is nothing left to go.
+ARRIVED = 1e-3
 # Where no linear program holds, SLSQP takes back every step until little is left of it, time and again.
 STUCK = 5e-4
 
@@ -89,7 +91,8 @@ def nearest(
         way.append(np.array(u))
         nearer.append(min(seen.values(), default=np.inf))
         before, worth = nearer[-3:][0], NEARER * nearer[0]
-        if np.max(np.abs(way[-1] - way[-2])) < STUCK or nearer[0] - before >= worth > before - nearer[-1]:
+        arrived = nearer[-1] <= ARRIVED * nearer[0]
+        if arrived or np.max(np.abs(way[-1] - way[-2])) < STUCK or nearer[0] - before >= worth > before - nearer[-1]:
             raise StopIteration
 
     # Older SciPy lets it through, newer ends there.

@@ -45,6 +45,8 @@ class GaussianProcess:
         Fit (y - mean) / sd instead of y.
     noise
         Fixed noise variance in the fitted unit; None learns it.
+    iterations
+        Of the search for the hyperparameters, at most.
     """
 
     mean: Callable[[], Mean] | None = None
@@ -52,6 +54,7 @@ class GaussianProcess:
     priors: bool = True
     standardise: bool = True
     noise: float | None = None
+    iterations: int = FIT_ITERATIONS
 
     def fit(self, x: torch.Tensor, y: torch.Tensor) -> SingleTaskGP:
         """The surrogate for x (n, d) and y (n,) or (n, m), m independent ones fitted at once; hyperparameters by log marginal likelihood.
@@ -71,7 +74,7 @@ class GaussianProcess:
                 warnings.simplefilter("ignore")
                 fit_gpytorch_mll(
                     ExactMarginalLogLikelihood(model.likelihood, model),
-                    optimizer_kwargs={"options": {"maxiter": FIT_ITERATIONS}},
+                    optimizer_kwargs={"options": {"maxiter": self.iterations}},
                     max_attempts=2,
                 )
         except (ModelFittingError, NanError, NotPSDError, RuntimeError) as error:
