@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from chargetune.control.compiler import compile_library, find_compiler
-from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
+from chargetune.learning.misfit import Misfit
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.sections import sections
 from chargetune.model.model import Model
@@ -206,7 +206,7 @@ class Twin:
         e = np.zeros(len(factor)) if guess is None or not data else np.linalg.solve(factor, guess)
         spread, cost_jacobian, unmodelled = noise, np.eye(len(factor)), np.zeros(len(names))
         for _ in range(1 + REFITS):
-            misfit = _Misfit(self, data, spread)
+            misfit = Misfit(self, data, spread)
             found = least_squares(misfit.values, e, jac=misfit.slopes, method="trf", x_scale=1.0, max_nfev=30, ftol=FTOL, xtol=XTOL)
             e, cost_jacobian = found.x, found.jac
             if not (data and discrepancy):
@@ -222,52 +222,6 @@ class Twin:
         parts = sections(misfit, np.asarray(e, np.float64), np.asarray(directions / np.sqrt(curvature)), self.scalars) if data else []
         apart = tuple((one.share, Posterior(self, factor @ one.mode, factor @ one.root, unmodelled, spread, seen)) for one in parts)
         return Posterior(self, factor @ e, root, unmodelled, spread, seen, apart)
-
-
-class _Misfit:
-    """|e|^2 + sum |(y - h(factor e)) / spread|^2 as the square of d + 1 numbers instead of as many as there are samples.
-
-    With r the residuals and J their slopes, the triangle R of [J r] = Q R has the same J'J, J'r and r'r, which is all that a
-    least-squares step sees. From the Cholesky factor of [J r]'[J r]: the prior keeps it far from singular.
-    """
-
-    def __init__(self, twin: Twin, data: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]) -> None:
-        self._twin, self._inputs = twin, [u for u, _ in data]
-        # Of every sample its weight, 0 where none was measured, and what was measured times that.
-        self._weights = [np.where(np.isfinite(y), 1.0 / spread, 0.0).ravel() for _, y in data]
-        self._wanted = [weight * np.nan_to_num(y.ravel()) for (_, y), weight in zip(data, self._weights, strict=True)]
-        d = len(twin.prior_factor)
-        self._whitened = np.eye(d + 1)
-        self._whitened[:d, :d] = twin.prior_factor
-        self._at, self._triangle = np.zeros(0), np.zeros((0, 0))
-
-    def values(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Shape (d + 1,)."""
-        return np.asarray(self._known(e)[:, -1])
-
-    def slopes(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
-        """With respect to e, shape (d + 1, d)."""
-        return np.asarray(self._known(e)[:, :-1])
-
-    def _known(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not np.array_equal(e, self._at):
-            own = np.hstack([np.eye(len(e)), e[:, None]])
-            squares = each(self._square, [e] * len(self._inputs), self._inputs, self._weights, self._wanted)
-            total = sum(squares, start=own.T @ own)
-            # Where the data fit to the last digit nothing is left of the last pivot but rounding.
-            total[-1, -1] += np.finfo(float).eps * (1.0 + np.trace(total))
-            self._at, self._triangle = e.copy(), np.linalg.cholesky(total).T
-        return self._triangle
-
-    def _square(
-        self, e: NDArray[np.float64], inputs: NDArray[np.float64], weight: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        twin, d = self._twin, len(e)
-        m = twin.prior_factor @ e
-        both = np.empty((len(weight), d + 1))
-        np.multiply(weight[:, None], twin.slopes(m, inputs).reshape(-1, d), out=both[:, :d])
-        np.subtract(weight * twin.predict(m, inputs).ravel(), wanted, out=both[:, d])
-        return np.asarray(self._whitened.T @ (both.T @ both) @ self._whitened)
 
 
 def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
