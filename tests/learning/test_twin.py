@@ -113,6 +113,17 @@ def test_missing_samples_and_short_traces_are_taken_as_they_are():
 
 
 @pytest.mark.usefixtures("virtual_machine")
+def test_where_the_record_of_the_input_ends_nothing_is_predicted_and_nothing_is_lost():
+    problem = charge()
+    episode = problem.episode(problem.space.default, 0)
+    lost = replace(episode, input=episode.input.copy(), output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
+    for values in (lost.input, lost.output_start, lost.output_end):
+        values[90:] = np.nan
+    whole, half = (twin_of(problem).fit([e], discrepancy=False) for e in (lost, episode.cut(90, episode.ending, "")))
+    np.testing.assert_allclose(whole.mode, half.mode, atol=1e-4)
+    np.testing.assert_allclose(whole.draw(4, 0), half.draw(4, 0), atol=1e-3)
+
+
 def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
     """What a real cell does not tell: the charge that it holds, where it starts, an OCV that is off."""
     loop = ChargingTwin(charge(seed=2), capacity_spread=0.05, soc_spread=0.02, ocv_spread_V=0.005)

@@ -57,6 +57,9 @@ class Misfit:
         twin, d = self._twin, len(e)
         m = twin.prior_factor @ e
         both = np.empty((len(weight), d + 1))
-        np.multiply(weight[:, None], twin.slopes(m, inputs).reshape(-1, d), out=both[:, :d])
-        np.subtract(weight * twin.predict(m, inputs).ravel(), wanted, out=both[:, d])
+        both[:, :d], both[:, d] = twin.slopes(m, inputs).reshape(-1, d), twin.predict(m, inputs).ravel()
+        # What was not measured may be predicted to be no number.
+        both[weight == 0.0] = 0.0
+        both *= weight[:, None]
+        both[:, d] -= wanted
         return np.asarray(self._whitened.T @ (both.T @ both) @ self._whitened)

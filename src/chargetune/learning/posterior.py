@@ -117,9 +117,17 @@ class Posterior:
         out = []
         for u, seen in self.seen:
             weight = np.where(seen, 1.0 / self.spread, 0.0).ravel()
-            slopes = self.twin.slopes(self.mode, u).reshape(-1, self.mode.size)
-            out.append((weight * self.twin.predict(self.mode, u).ravel(), weight[:, None] * slopes, weight))
+            out.append((weight * self._predicted(self.mode, u, weight), weight[:, None] * self._slopes(self.mode, u, weight), weight))
         return out
+
+    def _predicted(self, m: NDArray[np.float64], u: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """0 where nothing was measured: what is predicted there may be no number."""
+        return np.where(weight > 0.0, self.twin.predict(m, u).ravel(), 0.0)
+
+    def _slopes(self, m: NDArray[np.float64], u: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        slopes = self.twin.slopes(m, u).reshape(-1, m.size)
+        slopes[weight == 0.0] = 0.0
+        return slopes
 
     @cached_property
     def _precision(self) -> NDArray[np.float64]:
@@ -135,7 +143,7 @@ class Posterior:
         for (u, _), (_, slopes, weight), target in zip(self.seen, self._at_mode, wanted, strict=True):
             # A long step may lead where outputs are not finite: their misfit is nan, which is smaller than none, and it is not taken.
             with np.errstate(invalid="ignore", over="ignore"):
-                left = weight * self.twin.predict(m, u).ravel() - target
+                left = weight * self._predicted(m, u, weight) - target
                 total += float(left @ left)
                 pull = pull + left @ slopes
         return total, pull
@@ -144,7 +152,7 @@ class Posterior:
         """J'J of the whitened residuals at m, in the metric of the slopes that `_misfit` pulls with."""
         total = self._precision.copy()
         for (u, _), (_, slopes, weight) in zip(self.seen, self._at_mode, strict=True):
-            own = self.twin.slopes(m, u).reshape(-1, m.size)
+            own = self._slopes(m, u, weight)
             with np.errstate(invalid="ignore", over="ignore"):
                 total += (weight[:, None] * slopes).T @ own
         return total
