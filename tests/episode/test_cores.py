@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from chargetune.episode.cores import each, usable_cores
+from chargetune.episode.cores import each, meanwhile, usable_cores
 
 
 def test_results_are_in_order_and_come_from_as_many_threads_as_there_are_cores():
@@ -30,6 +30,36 @@ def test_an_exception_comes_out():
 
 def test_within_one_of_its_threads_it_goes_on_there():
     assert each(lambda k: each(lambda n: n * k, range(3)), range(2 * usable_cores())) == [[0, k, 2 * k] for k in range(2 * usable_cores())]
+
+
+def test_what_goes_on_meanwhile_has_begun_and_says_how_it_ended():
+    begun, more = threading.Event(), threading.Event()
+
+    def work(value):
+        begun.set()
+        assert more.wait(timeout=10)
+        return 7 // value
+
+    good = meanwhile(work, 2)
+    assert begun.wait(timeout=10)
+    assert not good.done()
+    bad = meanwhile(work, 0)
+    more.set()
+    assert good.result(timeout=10) == 3
+    with pytest.raises(ZeroDivisionError):
+        bad.result(timeout=10)
+
+
+def test_meanwhile_within_one_of_its_threads_does_not_wait_for_another():
+    """As many as there are threads: none of them is left to begin anything."""
+    together = threading.Barrier(usable_cores(), timeout=10)
+
+    def work(value):
+        together.wait()
+        done = meanwhile(lambda: 6 // value)
+        return done.result(timeout=10) if value else type(done.exception())
+
+    assert each(work, range(usable_cores())) == [ZeroDivisionError, *(6 // k for k in range(1, usable_cores()))]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")

@@ -181,7 +181,7 @@ def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
         belief = believe(loop, trials[:n])
         fits.append(len(loop.twin.foretold))
     assert fits == [1, 2, 2]
-    assert len(loop.twin.modes) == 3
+    assert len(loop.twin.ways) == 3
     assert len(loop.twin.newest) == 1
     fresh = believe(ChargingTwin(problem), trials)
     assert fresh.discrepancy.scale == belief.discrepancy.scale

@@ -13,7 +13,7 @@ from chargetune.battery.thermal import Anode, Thermal
 from chargetune.battery.theta import LimitBackoff
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning import Envelope
-from chargetune.learning.envelope import covering, predicted_rows
+from chargetune.learning.envelope import _rolled, covering, predicted_rows
 from chargetune.plants.sensors import Sensors
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -47,6 +47,21 @@ def test_slopes_along_a_trace_are_those_of_finite_differences(problem):
         step[i] = 1e-5
         ahead, behind = (predicted_rows(problem.controller, episode, theta + s * step)[0] for s in (1, -1))
         np.testing.assert_allclose(slopes[..., i], (ahead - behind) / 2e-5, atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("problem", "straight"),
+    [(charge(backoff=Backoff(nodes=5)), True), (charge(ratios=(ResistanceRatio("R1"),)), False)],
+    ids=["backoff", "R1"],
+)
+def test_rows_that_are_called_linear_in_theta_are(problem, straight):
+    """A second linear program would say nothing new of them; of a resistance that the estimator works with it does."""
+    episode, theta = problem.episode(), problem.space.default
+    assert _rolled(problem.controller).straight is straight
+    ahead = theta + 0.3 * (problem.space.upper - theta)
+    rows, slopes = predicted_rows(problem.controller, episode, theta)
+    off = predicted_rows(problem.controller, episode, ahead)[0] - (rows + slopes @ (ahead - theta))
+    assert bool(np.nanmax(np.abs(off)) < 1e-12) is straight
 
 
 def test_predictions_at_the_recorded_theta_are_the_controllers_own():

@@ -218,7 +218,8 @@ def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_d
     problem = charge(charge_time_to_soc=0.95, plant_model=TwoPairs(CELL))
     learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
     for windows, allowed in seen:
-        assert np.all(allowed <= np.maximum(np.nan_to_num(windows), safe_ask.AIMED - 1.0))
+        # Where nothing is held back that is the aim, to rounding.
+        assert np.all(allowed <= np.maximum(np.nan_to_num(windows), safe_ask.AIMED - 1.0) + 1e-9)
     assert len(seen) > 2
 
 

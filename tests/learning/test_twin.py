@@ -48,6 +48,34 @@ def test_sensitivities_are_those_of_finite_differences():
     np.testing.assert_allclose(slopes, np.sum(np.square(differences), axis=0), rtol=1e-4, atol=1e-9)
 
 
+def test_several_episodes_and_several_unknowns_at_once_are_as_one_after_the_other():
+    """Also more of them than go into one call, and episodes of different lengths."""
+    problem = charge()
+    twin = twin_of(problem)
+    inputs = [np.random.default_rng(k).uniform(0, 5, (length, 1)) for k, length in enumerate((30, 60, 17))]
+    unknowns = 0.1 * np.random.default_rng(9).standard_normal((19, 27))
+    together = twin.predict_each(unknowns, inputs)
+    assert [values.shape for values in together] == [(19, len(u), 2, 1) for u in inputs]
+    for u, values in zip(inputs, together, strict=True):
+        np.testing.assert_allclose(values, [twin.predict(m, u) for m in unknowns], rtol=0, atol=1e-12)
+    for u, values in zip(inputs, twin.slopes_each(unknowns[0], inputs), strict=True):
+        np.testing.assert_allclose(values, twin.slopes(unknowns[0], u), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("changes", [{}, {"plant_model": AnotherCell(CELL)}], ids=["the circuit", "another plant"])
+def test_a_fit_along_the_way_of_another_ends_where_it_would_by_itself(changes):
+    """Within a small part of a standard deviation, and it is as wide."""
+    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),), **changes)
+    twin = twin_of(problem)
+    episodes = [problem.episode(np.full(9, ratio), k) for k, ratio in enumerate((2.5, 2.0, 1.7, 1.5))]
+    alone = twin.fit(episodes)
+    along = twin.fit(episodes, way=twin.fit(episodes[:3]).way)
+    np.testing.assert_allclose(along.spread, alone.spread, rtol=0.02)
+    away = np.linalg.solve(alone.root, along.mode - alone.mode)
+    assert np.linalg.norm(away) < 0.3
+    np.testing.assert_allclose(np.diag(along.covariance), np.diag(alone.covariance), rtol=0.05)
+
+
 def test_without_data_it_is_the_prior():
     twin = twin_of(charge())
     posterior = twin.fit([])

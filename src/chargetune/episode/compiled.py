@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,7 @@ from chargetune.episode.cores import each
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.lattice import Lattice
 from chargetune.episode.stepwise import check_run, signal_indices
+from chargetune.model.evaluated import evaluated
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
@@ -51,7 +52,8 @@ class CompiledEpisode:
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
         """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
         given, unknown = self._arguments(theta, self.plant, seed, trips)
-        return self._episode(_evaluated(self.function, (self.steps, sum(self.widths)), given, unknown), self.plant, seed, trips)
+        (recorded,) = evaluated(self.function, given, unknown)
+        return self._episode(recorded, self.plant, seed, trips)
 
     def run_each(
         self,
@@ -86,10 +88,10 @@ class CompiledEpisode:
                 of_plant[id(plant)] = self._of_plant(plant, seed)
             given.append(self._given(of_theta[key], of_plant[id(plant)], table))
             unknown.append(of_plant[id(plant)].unknown)
-        evaluated = partial(_evaluated, self.function, (self.steps, sum(self.widths)))
+        run = partial(evaluated, self.function)
         # The loops alone go into threads, as machine code: all else waits for the interpreter.
-        recorded = each(evaluated, given, unknown) if self.compiled and len(plants) > 1 else list(map(evaluated, given, unknown))
-        return [self._episode(one, plant, seed, ()) for one, plant in zip(recorded, plants, strict=True)]
+        recorded = each(run, given, unknown) if self.compiled and len(plants) > 1 else list(map(run, given, unknown))
+        return [self._episode(one, plant, seed, ()) for (one,), plant in zip(recorded, plants, strict=True)]
 
     def _arguments(
         self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip]
@@ -157,20 +159,6 @@ class _OfPlant(NamedTuple):
     numbers: NDArray[np.float64]
     at_rest: NDArray[np.float64]
     unknown: NDArray[np.float64]
-
-
-def _evaluated(
-    function: ca.Function, shape: tuple[int, ...], given: NDArray[np.float64], unknown: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    recorded = np.empty(shape)
-    # CasADi reads and writes these arrays in place; C order with one row an interval is its column-major order.
-    buffer: Any
-    buffer, evaluate = function.buffer()
-    buffer.set_arg(0, given.data)
-    buffer.set_arg(1, unknown.data)
-    buffer.set_res(0, recorded.data)
-    evaluate()
-    return recorded
 
 
 def compiled_episode(

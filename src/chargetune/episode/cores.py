@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
-__all__ = ["each", "usable_cores"]
+__all__ = ["each", "meanwhile", "usable_cores"]
 
 Result = TypeVar("Result")
 
@@ -27,9 +27,28 @@ def each(function: Callable[..., Result], *arguments: Iterable[object]) -> list[
 
     Called from one of these threads it goes on in that thread: one that waited for the others could wait for ever.
     """
-    if threading.current_thread().name.startswith(NAME):
+    if _within():
         return list(map(function, *arguments))
     return list(_threads(usable_cores(), os.getpid()).map(function, *arguments))
+
+
+def meanwhile(function: Callable[..., Result], *arguments: object) -> Future[Result]:
+    """Begins ``function(*arguments)`` in one of the threads of `each` and returns at once; ``result()`` waits for what it returns.
+
+    From one of these threads it is what ``result()`` is ready with: the others may all wait for this one.
+    """
+    if not _within():
+        return _threads(usable_cores(), os.getpid()).submit(function, *arguments)
+    done: Future[Result] = Future()
+    try:
+        done.set_result(function(*arguments))
+    except Exception as error:  # noqa: BLE001  it comes out where the result is asked for
+        done.set_exception(error)
+    return done
+
+
+def _within() -> bool:
+    return threading.current_thread().name.startswith(NAME)
 
 
 @lru_cache(maxsize=1)

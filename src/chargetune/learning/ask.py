@@ -43,9 +43,18 @@ class Ask:
     seed: int
     aimed: ClassVar[float] = AIMED
 
+    def draw(self) -> None:
+        """Begins to draw the plants of `predicted`, while something else goes on."""
+        self.belief.draw(self.draws, self.seed)
+
+    @property
+    def draws(self) -> int:
+        """Plants of an ensemble."""
+        return DRAWS if self.belief.proved else DRAWS_UNPROVED
+
     def predicted(self, theta: NDArray[np.float64]) -> Prediction:
         """What an ensemble of plants does with theta, the same plants for every theta."""
-        return self.belief.predict(theta, DRAWS if self.belief.proved else DRAWS_UNPROVED, self.seed)
+        return self.belief.predict(theta, self.draws, self.seed)
 
     def tried(self, trial: TrialLike) -> Candidate:
         """The theta of a trial with what an ensemble of plants does under the inputs of that trial, where they were recorded."""

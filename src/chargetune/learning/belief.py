@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -11,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.cores import meanwhile
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.discrepancy import Discrepancy, OutputError, scale_of
@@ -129,9 +131,15 @@ class Belief:
         mode = self.posterior.mode
         return mode, self.discrepancy.error(mode) if self.discrepancy else None
 
+    def draw(self, count: int, seed: int) -> None:
+        """Begins to draw the plants of `predict` with this count and seed, while something else goes on."""
+        if (count, seed) not in self._drawn:
+            self._begun[count, seed] = meanwhile(self.posterior.draw, count, seed)
+
     def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], OutputError | None]]:
         if (count, seed) not in self._drawn:
-            draws = self.posterior.draw(count, seed)
+            begun = self._begun.pop((count, seed), None)
+            draws = begun.result() if begun else self.posterior.draw(count, seed)
             seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
             errors = self.discrepancy.errors(draws, seeds) if self.discrepancy else [None] * count
             self._drawn[count, seed] = list(zip(draws, errors, strict=True))
@@ -143,6 +151,10 @@ class Belief:
 
     @cached_property
     def _scored(self) -> dict[bytes, Score | None]:
+        return {}
+
+    @cached_property
+    def _begun(self) -> dict[tuple[int, int], Future[NDArray[np.float64]]]:
         return {}
 
     @cached_property
@@ -250,8 +262,8 @@ def _learnt(loop: TwinLoop, episodes: Sequence[Episode], keys: Sequence[bytes]) 
     twin = loop.twin
     if keys[-1] not in twin.newest:
         newest = tuple(episodes[-TRACES_MAX:])
-        posterior = twin.fit(newest, guess=twin.modes[keys[-2]] if len(keys) > 1 else None)
-        twin.modes[keys[-1]] = posterior.mode
+        posterior = twin.fit(newest, way=twin.ways[keys[-2]] if len(keys) > 1 else ())
+        twin.ways[keys[-1]] = posterior.way
         twin.newest.clear()
         twin.newest[keys[-1]] = Discrepancy(posterior, newest, loop.features)
     return twin.newest[keys[-1]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -71,6 +71,7 @@ class Discrepancy:
     episodes: tuple[Episode, ...]
     features: Mapping[str, tuple[float, float]]
     scale: float = 1.0
+    like: Discrepancy | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.features) <= len(LENGTH):
@@ -78,13 +79,13 @@ class Discrepancy:
 
     def scaled(self, scale: float) -> Discrepancy:
         """The same with another scale, which the hyperparameters do not depend on: they are those of the residuals."""
-        other = replace(self, scale=scale)
-        vars(other).update(_data=self._data, _fitted=self._fitted)
-        return other
+        return replace(self, scale=scale, like=self)
 
     def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
         """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
-        left = self._residuals(unknowns)
+        return self._error(self._residuals(unknowns), seed)
+
+    def _error(self, left: NDArray[np.float64], seed: int | None) -> OutputError:
         stream = None if seed is None else np.random.default_rng(seed)
         tables = []
         for i, part in enumerate(self._parts):
@@ -97,7 +98,7 @@ class Discrepancy:
     def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[OutputError]:
         """A sample of `error` for each of several plants, unknowns of shape (plants, d)."""
         each(lambda part: part.root, self._parts)
-        return each(self.error, unknowns, seeds)
+        return each(self._error, self._residuals(unknowns), seeds)
 
     def foretold(self, episode: Episode) -> Foretold:
         """How well an episode that was not learnt from was predicted, at its recorded inputs.
@@ -163,13 +164,20 @@ class Discrepancy:
         return out
 
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean residual of every stretch, shape (n, outputs); 0 where nothing was measured."""
-        twin = self.posterior.twin
-        out = [blocks(twin.measured(e) - twin.predict(unknowns, e.input))[0] for e in self.episodes]
-        return np.nan_to_num(np.concatenate(out), nan=0.0)
+        """Mean residual of every stretch, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
+        twin, several = self.posterior.twin, unknowns.shape[:-1]
+        predicted = twin.predict_each(unknowns, [e.input for e in self.episodes])
+        out = []
+        for episode, values in zip(self.episodes, predicted, strict=True):
+            measured = twin.measured(episode)
+            means = [blocks(measured - own)[0] for own in values.reshape(-1, *measured.shape)]
+            out.append(np.stack(means).reshape(*several, *means[0].shape))
+        return np.nan_to_num(np.concatenate(out, axis=len(several)), nan=0.0)
 
     @cached_property
-    def _data(self) -> _Data:
+    def data(self) -> _Data:
+        if self.like:
+            return self.like.data
         twin = self.posterior.twin
         counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
         at = np.concatenate([self._at(episode) for episode in self.episodes])
@@ -186,19 +194,21 @@ class Discrepancy:
         return name in self.posterior.twin.model.state_names and not self._inputs.all()
 
     @cached_property
-    def _fitted(self) -> tuple[_Fitted, ...]:
-        left, data = self._residuals(self.posterior.mode), self._data
+    def fitted(self) -> tuple[_Fitted, ...]:
+        if self.like:
+            return self.like.fitted
+        left, data = self._residuals(self.posterior.mode), self.data
         on = np.array([np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd])[:, None]
         return _fit(data.at * on, left.T, data.variance.T, self.lattice.nodes * on)
 
     @cached_property
     def _parts(self) -> tuple[_Part, ...]:
-        twin, nodes, inputs, data = self.posterior.twin, self.lattice.nodes, self._inputs, self._data
+        twin, nodes, inputs, data = self.posterior.twin, self.lattice.nodes, self._inputs, self.data
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
         flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs.any() else np.ones(len(nodes))
         parts = []
-        for i, (name, fitted) in enumerate(zip(twin.noise_sd, self._fitted, strict=True)):
+        for i, (name, fitted) in enumerate(zip(twin.noise_sd, self.fitted, strict=True)):
             least = self.scale * twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing)
             # One trajectory that the model fits says little of others.
             parts.append(_part(fitted.kernel * (fitted.variance + np.outer(least, least)), data.variance[:, i], data.weights))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -17,6 +17,7 @@ from chargetune.control.controller import Controller
 from chargetune.control.mpc import cached
 from chargetune.episode.episode import Episode
 from chargetune.learning.tuner import TrialLike, check_count
+from chargetune.model.evaluated import evaluated
 from chargetune.model.parameters import ParameterSpace
 from chargetune.model.parametric import parametric
 
@@ -118,7 +119,7 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     apply at that end.
     """
     memory = controller.estimator.initial(controller.model, np.array(controller.start))
-    step, of_fixed = cached(f"rows {controller.structure}", lambda: _step(controller))
+    step, of_fixed, _ = _rolled(controller)
     names = controller.estimator.signals(controller.model)
     received = np.full((len(episode), len(names)), np.nan)
     for i, name in enumerate(names):
@@ -130,10 +131,10 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
     d, count = len(theta), len(episode)
     roll = cached(f"rolled rows {controller.structure} {count}", lambda: step.mapaccum("rolled", count, 2))
-    q = ca.repmat(of_fixed(theta, controller.model.nominal), 1, count)
-    _, _, rows, slopes = roll(memory, np.zeros((memory.size, d)), received.T, last.T, episode.input.T, q)
-    width = rows.shape[0] // 2
-    return np.array(rows).T.reshape(count, 2, width), np.array(slopes).T.reshape(count, d, 2, width).transpose(0, 2, 3, 1)
+    (q,) = evaluated(of_fixed, theta, controller.model.nominal)
+    given = (memory, np.zeros((d, memory.size)), received, last, episode.input, np.tile(q, (count, 1)))
+    _, _, rows, slopes = evaluated(roll, *given)
+    return rows.reshape(count, 2, -1), slopes.reshape(count, d, 2, -1).transpose(0, 2, 3, 1)
 
 
 def covering(
@@ -183,7 +184,7 @@ def covering(
         if found.x is None:
             return theta
         before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
-        if number + 1 == LINEARISATIONS:
+        if number + 1 == LINEARISATIONS or _rolled(controller).straight:
             break
         straight = rows + slopes @ (theta - before)
         rows, slopes = predicted_rows(controller, episode, theta)
@@ -227,8 +228,22 @@ def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float6
     return np.asarray(np.all((episode.input >= upper - room) | (episode.input <= lower + room), axis=1))
 
 
-def _step(controller: Controller) -> tuple[ca.Function, ca.Function]:
-    """(memory, its slopes, received, last input, input, q) -> (memory, its slopes, rows, theirs) an interval ahead; (theta, p) -> q."""
+class _Rolled(NamedTuple):
+    """One interval of the rows that a controller predicts."""
+
+    step: ca.Function
+    """(memory, its slopes, received, last input, input, q) -> (memory, its slopes, rows, theirs) an interval ahead."""
+    of_fixed: ca.Function
+    """(theta, p) -> q."""
+    straight: bool
+    """Whether the rows are linear in theta, whatever was recorded."""
+
+
+def _rolled(controller: Controller) -> _Rolled:
+    return cached(f"rows {controller.structure}", lambda: _step(controller))
+
+
+def _step(controller: Controller) -> _Rolled:
     model, estimator = controller.model, controller.estimator
     names = estimator.signals(model)
     nm, d = estimator.initial(model, np.array(controller.start)).size, controller.theta.dimension
@@ -248,8 +263,13 @@ def _step(controller: Controller) -> tuple[ca.Function, ca.Function]:
             rows.append(row if applies else ca.SX.nan(*row.shape))
     every = ca.vertcat(*rows)
 
-    def total(value: Any) -> Any:
-        return ca.densify(ca.jacobian(value, theta) + ca.mtimes(ca.jacobian(value, memory), slopes))
+    # Most thetas are of limits and of resistances, which the estimator knows nothing of.
+    known = not ca.depends_on(ahead, theta)
 
-    arguments = [memory, slopes, received, last, u]
-    return parametric("rows", arguments, [theta, nominal], [ahead, total(ahead), every, ca.vec(total(every))])
+    def total(value: Any) -> Any:
+        own = ca.jacobian(value, theta)
+        return ca.densify(own if known else own + ca.mtimes(ca.jacobian(value, memory), slopes))
+
+    rise = ca.vec(total(every))
+    step, of_fixed = parametric("rows", [memory, slopes, received, last, u], [theta, nominal], [ahead, total(ahead), every, rise])
+    return _Rolled(step, of_fixed, known and not ca.depends_on(rise, theta))

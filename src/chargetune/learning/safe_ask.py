@@ -67,6 +67,8 @@ class SafeAsk(Ask):
             # Trials that left no trace have taught nothing.
             return [self._start()]
         self._check_budget()
+        # Only what comes after the envelope steps needs the ensemble.
+        self.draw()
         begin = self.candidate(self._expected_best())
         deviations = self._deviations(begin)
         passed = self._rounds(begin, deviations)

@@ -13,7 +13,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from chargetune.control.compiler import compile_library, find_compiler
+from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.learning.misfit import Misfit
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.sections import sections
+from chargetune.model.evaluated import evaluated
 from chargetune.model.model import Model
 from chargetune.model.parametric import parametric
 
@@ -42,8 +44,13 @@ BLOCKS = 40
 TOGETHER = 4.0
 # Intervals of the shortest roll-out that is built; longer ones are this times a power of two.
 SHORTEST = 45
+# Unknowns that are simulated in one call: enough that nothing waits for the interpreter, few enough for every core to have some.
+AT_ONCE = 8
 # A step that changes the misfit, or the unknowns, by less than this is the last one.
 FTOL, XTOL = 1e-6, 1e-5
+# The same of the misfit where the search begins at the end of an earlier one. With noise alone a plant of another kind has a long valley,
+# which 30 evaluations did not come to the end of; what is wanted there is the size of the residuals, and that is known to a percent.
+FTOL_KNOWN = 1e-4
 
 
 @dataclass(frozen=True)
@@ -123,8 +130,8 @@ class Twin:
         return {}
 
     @cached_property
-    def modes(self) -> dict[bytes, NDArray[np.float64]]:
-        """Modes after some episodes: the next search begins there."""
+    def ways(self) -> dict[bytes, tuple[NDArray[np.float64], ...]]:
+        """`Posterior.way` after some episodes: the next fit goes along it."""
         return {}
 
     @cached_property
@@ -165,54 +172,63 @@ class Twin:
 
     def predict(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Measured outputs at both ends of every interval under ``inputs`` (K, nu), shape (K, 2, number of measured outputs)."""
-        flat = self._roll(0, m, inputs)
-        return flat.reshape(-1, 2, len(self.noise_sd))[: len(inputs)]
+        return self.predict_each(m, [inputs])[0]
+
+    def predict_each(self, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        """`predict` under the inputs of each of several episodes, at once; of m (n, d) each is of shape (n, K, 2, outputs)."""
+        return self._roll(0, m, inputs, (2, len(self.noise_sd)))
 
     def slopes(self, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Exact slopes of `predict` with respect to m, shape (K, 2, number of measured outputs, d)."""
-        flat = self._roll(1, m, inputs)
-        return flat.reshape(-1, 2, len(self.noise_sd), sum(self.sizes))[: len(inputs)]
+        return self.slopes_each(m, [inputs])[0]
 
-    def _roll(self, which: int, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        length = _padded(len(inputs))
-        padded = np.vstack([inputs, np.zeros((length - len(inputs), inputs.shape[1]))])
-        function = _simulated(_Key(self), length)[which]
-        given = [np.ascontiguousarray(part, dtype=float) for part in (m, *_numbers(self), padded)]
-        out = np.empty(function.size_out(0)[::-1])
-        # CasADi reads and writes these arrays in place, by columns: one column an interval is C order with one row an interval.
-        buffer: Any
-        buffer, evaluate = function.buffer()
-        for i, part in enumerate(given):
-            buffer.set_arg(i, part.data)
-        buffer.set_res(0, out.data)
-        evaluate()
-        return out
+    def slopes_each(self, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+        """`slopes` under the inputs of each of several episodes, at once."""
+        return self._roll(1, m, inputs, (2, len(self.noise_sd), sum(self.sizes)))
+
+    def _roll(
+        self, which: int, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]], shape: tuple[int, ...]
+    ) -> list[NDArray[np.float64]]:
+        """What the function of that number says of each interval, in this shape, after the first axes of m."""
+        padded = np.zeros((len(inputs), _padded(max(len(u) for u in inputs)), len(self.model.inputs)))
+        for row, u in zip(padded, inputs, strict=True):
+            row[: len(u)] = u
+        function = partial(_evaluated, _Key(self), which, padded)
+        several, d = m.shape[:-1], m.shape[-1]
+        rows = m.reshape(-1, d)
+        parts = each(function, [rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)]) if len(rows) > 1 else [function(rows)]
+        out = np.concatenate(parts).reshape(len(rows), *padded.shape[:2], *shape)
+        return [out[:, k, : len(u)].reshape(*several, len(u), *shape) for k, u in enumerate(inputs)]
 
     def measured(self, episode: Episode) -> NDArray[np.float64]:
         """The measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
         return np.stack([np.stack(episode.signal(name), axis=1) for name in self.noise_sd], axis=2)
 
-    def fit(self, episodes: Sequence[Episode], *, discrepancy: bool = True, guess: NDArray[np.float64] | None = None) -> Posterior:
+    def fit(self, episodes: Sequence[Episode], *, discrepancy: bool = True, way: Sequence[NDArray[np.float64]] = ()) -> Posterior:
         """The posterior from the measured outputs of these episodes; samples that are not finite are left out.
 
         With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with
         the variance it adds. Where the means of whole stretches are not zero, neighbouring residuals have one cause, and all
-        samples of `TOGETHER` stretches count as one. ``guess`` is where the search for the mode begins. Without episodes it is
-        the prior.
+        samples of `TOGETHER` stretches count as one. ``way`` are the modes that a fit of most of these episodes went through: each of
+        its searches begins where that one's ended. Without episodes it is the prior.
         """
         names, factor = list(self.noise_sd), self.prior_factor
         data = [(e.input, self.measured(e)) for e in episodes if len(e)]
         noise = np.array([self.noise_sd[name] for name in names])
-        e = np.zeros(len(factor)) if guess is None or not data else np.linalg.solve(factor, guess)
-        spread, cost_jacobian, unmodelled = noise, np.eye(len(factor)), np.zeros(len(names))
-        for _ in range(1 + REFITS):
+        e, spread, cost_jacobian, unmodelled = np.zeros(len(factor)), noise, np.eye(len(factor)), np.zeros(len(names))
+        modes: list[NDArray[np.float64]] = []
+        for k in range(1 + REFITS):
+            known = bool(data) and k < len(way)
+            begin, ftol = (np.linalg.solve(factor, way[k]), FTOL_KNOWN) if known else (e, FTOL)
             misfit = Misfit(self, data, spread)
-            found = least_squares(misfit.values, e, jac=misfit.slopes, method="trf", x_scale=1.0, max_nfev=30, ftol=FTOL, xtol=XTOL)
+            found = least_squares(misfit.values, begin, jac=misfit.slopes, method="trf", x_scale=1.0, max_nfev=30, ftol=ftol, xtol=XTOL)
             e, cost_jacobian = found.x, found.jac
+            modes.append(factor @ e)
             if not (data and discrepancy):
                 break
             before = spread
-            unmodelled, spread = _unmodelled([y - self.predict(factor @ e, u) for u, y in data], noise)
+            predicted = self.predict_each(factor @ e, [u for u, _ in data])
+            unmodelled, spread = _unmodelled([y - own for (_, y), own in zip(data, predicted, strict=True)], noise)
             if np.allclose(spread, before, rtol=0.02):
                 break
         # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.
@@ -221,7 +237,7 @@ class Twin:
         seen = tuple((u, np.isfinite(y)) for u, y in data)
         parts = sections(misfit, np.asarray(e, np.float64), np.asarray(directions / np.sqrt(curvature)), self.scalars) if data else []
         apart = tuple((one.share, Posterior(self, factor @ one.mode, factor @ one.root, unmodelled, spread, seen)) for one in parts)
-        return Posterior(self, factor @ e, root, unmodelled, spread, seen, apart)
+        return Posterior(self, factor @ e, root, unmodelled, spread, seen, apart, tuple(modes))
 
 
 def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -304,6 +320,20 @@ def _padded(count: int) -> int:
     while length < count:
         length *= 2
     return length
+
+
+def _evaluated(key: _Key, which: int, inputs: NDArray[np.float64], m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The function of that number at several m (n, d), each under several inputs (episodes, K, nu): one call, n * episodes results."""
+    count = len(m) * len(inputs)
+    given = [np.repeat(m, len(inputs), axis=0), *(np.tile(one, (count, 1)) for one in _numbers(key.twin)), np.tile(inputs, (len(m), 1, 1))]
+    (out,) = evaluated(_mapped(key, inputs.shape[1], which, count), *given)
+    return out
+
+
+@lru_cache(maxsize=128)
+def _mapped(key: _Key, length: int, which: int, count: int) -> ca.Function:
+    one = _simulated(key, length)[which]
+    return one if count == 1 else one.map(count)
 
 
 @lru_cache(maxsize=32)
