@@ -119,8 +119,9 @@ class Belief:
         """
         twin, out = self.loop.twin, []
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
-        for m, error in self._plants(count, seed):
-            values = twin.predict(m, episode.input)
+        plants = self._plants(count, seed)
+        (predicted,) = twin.predict_each(np.array([m for m, _ in plants]), [episode.input])
+        for values, (_, error) in zip(predicted, plants, strict=True):
             own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
             own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
             out.append(error(own) if error else own)
