@@ -15,6 +15,7 @@ from chargetune.battery.theta import Backoff
 from chargetune.battery.twin import ChargingTwin
 from chargetune.episode.lattice import Lattice
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
+from chargetune.learning import twin as twin_module
 from chargetune.learning.ask import Ask
 from chargetune.learning.belief import believe
 from chargetune.learning.twin_tuner import cautious
@@ -63,17 +64,34 @@ def test_several_episodes_and_several_unknowns_at_once_are_as_one_after_the_othe
 
 
 @pytest.mark.parametrize("changes", [{}, {"plant_model": AnotherCell(CELL)}], ids=["the circuit", "another plant"])
-def test_a_fit_along_the_way_of_another_ends_where_it_would_by_itself(changes):
-    """Within a small part of a standard deviation, and it is as wide."""
+def test_a_fit_along_the_way_of_another_ends_where_it_would_by_itself(changes, monkeypatch):
+    """Within a small part of a standard deviation, and it is as wide; each search begins where the one before ended."""
     problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),), **changes)
     twin = twin_of(problem)
     episodes = [problem.episode(np.full(9, ratio), k) for k, ratio in enumerate((2.5, 2.0, 1.7, 1.5))]
-    alone = twin.fit(episodes)
-    along = twin.fit(episodes, way=twin.fit(episodes[:3]).way)
+    alone, way = twin.fit(episodes), twin.fit(episodes[:3]).way
+    begun, search = [], twin_module.least_squares
+    monkeypatch.setattr(twin_module, "least_squares", lambda f, e, **how: (begun.append(e), search(f, e, **how))[1])
+    along = twin.fit(episodes, way=way)
+    np.testing.assert_allclose([twin.prior_factor @ e for e in begun[: len(way)]], way[: len(begun)], atol=1e-9)
     np.testing.assert_allclose(along.spread, alone.spread, rtol=0.02)
     away = np.linalg.solve(alone.root, along.mode - alone.mode)
     assert np.linalg.norm(away) < 0.3
     np.testing.assert_allclose(np.diag(along.covariance), np.diag(alone.covariance), rtol=0.05)
+
+
+def test_plants_whose_drawing_was_begun_are_those_that_are_drawn_when_they_are_needed():
+    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    episode = problem.episode(np.full(9, 2.5))
+    trials = [SimpleNamespace(number=0, theta=(2.5,) * 9, status="done", score=problem.score(episode), episode=lambda: episode)]
+    loop = ChargingTwin(problem)
+    begun, needed = believe(loop, trials), believe(loop, trials)
+    begun.draw(6, 1)
+    drawn = begun.replayed(episode, 6, 1).episodes
+    for one, other in zip(drawn, needed.replayed(episode, 6, 1).episodes, strict=True):
+        np.testing.assert_array_equal(one.output_end, other.output_end)
+    # Another seed has other plants.
+    assert not np.array_equal(begun.replayed(episode, 6, 2).episodes[0].output_end, drawn[0].output_end)
 
 
 def test_without_data_it_is_the_prior():
