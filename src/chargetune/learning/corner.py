@@ -1,16 +1,16 @@
-"""Sequential linear programming: the best point within many limits at once, which is a corner of them."""
+"""Sequential programming: the best point within many limits at once, which is a corner of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-__all__ = ["Evaluate", "Point", "corner"]
+__all__ = ["Evaluate", "Lines", "Point", "Programme", "corner"]
 
 # Step of the finite differences.
 STEP = 2e-3
@@ -20,8 +20,8 @@ RADIUS, LONGEST, SHORTEST = 0.1, 0.3, 1e-4
 HOLDS, POOR, GOOD = 0.1, 0.3, 0.75
 # A step that does not hold it is corrected so often, and then taken this much shorter.
 CORRECTIONS, SHORTER = 2, 0.25
-# Where a row stays broken for what mending it costs, it may cost this much more.
-DEARER = 10.0
+# Where a row stays broken for what mending it costs, it may cost this much more, so often.
+DEARER, TIMES = 10.0, 4
 
 
 class Point(NamedTuple):
@@ -39,48 +39,126 @@ Evaluate = Callable[[Sequence[NDArray[np.float64]]], Sequence[Point | None]]
 """Points of the unit cube -> what they are worth, None where that is not known."""
 
 
-def corner(evaluate: Evaluate, start: NDArray[np.float64], iterations: int, gain: float, kept: float = 0.0) -> NDArray[np.float64]:
+@dataclass(frozen=True)
+class Lines:
+    """Objective and rows around a point u, by their slopes there."""
+
+    u: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+    def room(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The least and the largest step, within the unit cube."""
+        return np.maximum(-radius, -self.u), np.minimum(radius, 1.0 - self.u)
+
+    def near(self, radius: float, bent: NDArray[np.float64] | float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The rows that a step of this radius may break, and their slopes; ``bent``: by how much they are known to be above these lines."""
+        rows = self.rows + bent
+        near = rows + radius * np.abs(self.jacobian).sum(axis=1) > 0
+        return rows[near], self.jacobian[near]
+
+
+class Programme(Protocol):
+    """What a step is taken by."""
+
+    @property
+    def radius(self) -> float:
+        """Of the first step."""
+        ...
+
+    @property
+    def price(self) -> float:
+        """Of a violation at first, as a share of the objective."""
+        ...
+
+    @property
+    def least(self) -> float:
+        """What the objective cannot be below."""
+        ...
+
+    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+        """The best step and the violation it leaves; ``bent`` as in `Lines.near`."""
+        ...
+
+    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+        """By how much a step lowers the objective."""
+        ...
+
+
+class _Linear:
+    radius: ClassVar[float] = RADIUS
+    price: ClassVar[float] = 1.0
+    least: ClassVar[float] = -np.inf
+
+    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+        d = lines.u.size
+        rows, jacobian = lines.near(radius, bent)
+        matrix = np.hstack([jacobian, -np.ones((rows.size, 1))])
+        bounds = [*zip(*lines.room(radius), strict=True), (0.0, None)]
+        found = linprog(np.append(lines.gradient, price), A_ub=matrix, b_ub=-rows, bounds=bounds, method="highs")
+        return (np.zeros(d), 0.0) if found.x is None else (found.x[:d], float(found.x[d]))
+
+    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+        return -float(lines.gradient @ step)
+
+
+def corner(
+    evaluate: Evaluate,
+    start: NDArray[np.float64],
+    iterations: int,
+    gain: float,
+    kept: float = 0.0,
+    programme: Programme | None = None,
+) -> NDArray[np.float64]:
     """The best point of the unit cube that keeps all rows, from ``start``, which need not.
 
         min f(u)  s.t.  c(u) <= 0,  0 <= u <= 1
 
-    by linear programs (HiGHS) with finite differences g, J, within a trust region,
+    by linear programs (HiGHS; or another ``programme``) with finite differences g, J, within a trust region,
 
         min g'd + rho t  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
 
     A step is taken when f + rho max(0, max c) falls as it says. When it does not it is corrected with what the rows were found to be
     there, c(u + d) - J d, and then shortened. It ends after so many ``iterations``, or when a step promises less than the share
-    ``gain`` of f; that it mends rows does not count where none is broken by more than ``kept``. A charge that rides its limits all
-    the way has as many samples at a limit as theta has entries: its theta is a corner of them, at which a linear program arrives like
-    Newton's method.
+    ``gain`` of f; that it mends rows does not count where none is broken by more than ``kept``, and where one is it costs more first.
+    A charge that rides its limits all the way has as many samples at a limit as theta has entries: its theta is a corner of them, at
+    which a linear program arrives like Newton's method. A row of which nothing is known is -inf.
     Source: Fletcher and Sainz de la Maza, Math. Program. 43 (1989) 235; the correction: Nocedal and Wright, Numerical Optimization
     (2006), section 15.6.
     """
     (here,) = evaluate([start])
     if here is None:
         return start
-    u, radius, price = start, RADIUS, abs(here.objective) or 1.0
+    programme = programme or _Linear()
+    u, radius, price = start, programme.radius, programme.price * (abs(here.objective) or 1.0)
+    longest, dearest = max(radius, LONGEST), price * DEARER**TIMES
     for _ in range(iterations):
+        if here.violation <= kept and here.objective - programme.least < gain * abs(here.objective):
+            return u
         lines = _linearised(evaluate, u, here)
         while True:
-            step, left = lines.step(radius, price)
-            promised = price * (here.violation - left) - float(lines.gradient @ step)
+            step, left = programme.step(lines, radius, price)
+            promised = price * (here.violation - left) + programme.falls(lines, step)
             mended = price * (here.violation - left) if here.violation <= kept else 0.0
             if promised - mended < gain * abs(here.objective) or radius < SHORTEST:
-                return u
+                if here.violation <= kept or price >= dearest or radius < SHORTEST:
+                    return u
+                price *= DEARER
+                continue
             there, held = _held(evaluate, u, here, step, price)
             for _ in range(CORRECTIONS):
                 if there is None or held >= HOLDS * promised:
                     break
-                step, _ = lines.step(radius, price, there.rows - here.rows - lines.jacobian @ step)
+                step, _ = programme.step(lines, radius, price, _rise(here.rows, there.rows) - lines.jacobian @ step)
                 there, held = _held(evaluate, u, here, step, price)
             if there is not None and held >= HOLDS * promised:
                 break
-            radius *= SHORTER
+            radius = SHORTER * min(radius, float(np.max(np.abs(step))))
         if held < POOR * promised:
             radius /= 2
         elif held > GOOD * promised and np.max(np.abs(step)) > 0.9 * radius:
-            radius = min(2 * radius, LONGEST)
+            radius = min(2 * radius, longest)
         price *= DEARER if left > 0 and here.violation - left < HOLDS * here.violation else 1.0
         u, here = u + step, there
     return u
@@ -94,31 +172,16 @@ def _held(evaluate: Evaluate, u: NDArray[np.float64], here: Point, step: NDArray
     return there, here.objective - there.objective + price * (here.violation - there.violation)
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """Objective and rows around a point u, by their slopes there."""
-
-    u: NDArray[np.float64]
-    rows: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    jacobian: NDArray[np.float64]
-
-    def step(self, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
-        """The best step and the violation it leaves; ``bent``: by how much the rows are known to be above these lines."""
-        d = self.u.size
-        rows = self.rows + bent
-        near = rows + radius * np.abs(self.jacobian).sum(axis=1) > 0
-        matrix = np.hstack([self.jacobian[near], -np.ones((int(near.sum()), 1))])
-        bounds = [*zip(np.maximum(-radius, -self.u), np.minimum(radius, 1.0 - self.u), strict=True), (0.0, None)]
-        found = linprog(np.append(self.gradient, price), A_ub=matrix, b_ub=-rows[near], bounds=bounds, method="highs")
-        return (np.zeros(d), 0.0) if found.x is None else (found.x[:d], float(found.x[d]))
-
-
-def _linearised(evaluate: Evaluate, u: NDArray[np.float64], here: Point) -> _Lines:
+def _linearised(evaluate: Evaluate, u: NDArray[np.float64], here: Point) -> Lines:
     steps = np.where(u + STEP <= 1.0, STEP, -STEP)
     gradient, jacobian = np.zeros(u.size), np.zeros((here.rows.size, u.size))
     for i, (step, ahead) in enumerate(zip(steps, evaluate([u + one for one in np.diag(steps)]), strict=True)):
         if ahead is not None and ahead.rows.shape == here.rows.shape:
             gradient[i] = (ahead.objective - here.objective) / step
-            jacobian[:, i] = (ahead.rows - here.rows) / step
-    return _Lines(u, here.rows, gradient, jacobian)
+            jacobian[:, i] = _rise(here.rows, ahead.rows) / step
+    return Lines(u, here.rows, gradient, jacobian)
+
+
+def _rise(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From rows to rows; 0 where one of them is not known."""
+    return np.subtract(after, before, out=np.zeros_like(before), where=np.isfinite(before) & np.isfinite(after))

@@ -180,7 +180,9 @@ def covering(
         signed = csr_matrix(sign[:, None] * steep)
         matrix = hstack([-signed, signed, -identity(n)]).tocsc()
         most = np.concatenate([np.maximum(upper - theta, 0.0), np.maximum(theta - lower, 0.0), np.full(n, np.inf)])
-        found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=np.stack([np.zeros_like(most), most], axis=1), method="highs")
+        bounds = np.stack([np.zeros_like(most), most], axis=1)
+        # Presolve took two fifths of the time and saved no iteration.
+        found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=bounds, method="highs", options={"presolve": False})
         if found.x is None:
             return theta
         before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import nnls
 
-from chargetune.learning.corner import STEP
+from chargetune.learning.corner import Lines, Point, corner
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import ParameterSpace
 
@@ -16,26 +18,18 @@ __all__ = ["nearest"]
 
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
-ITERATIONS = 12
-# Beyond where it starts and where it is to be near it looks no further than this: SLSQP has no trust region, and left for good.
-ASIDE = 0.1
-# From afar SLSQP may end beside what is allowed: then a part of that way may do.
-PARTS = (0.8, 0.6, 0.4, 0.2)
-# Samples further inside their limits than so many tolerances say nothing.
-FAR = 1000.0
-# SLSQP ends a little on the wrong side: of a tolerance, and of the gain.
+ITERATIONS = 8
+# A search ends a little on the wrong side: of a tolerance, and of the gain.
 ROUNDING = 0.1
-# SLSQP ends when distance and limits both are within one number of where they should be. In these units a rounding is that number;
-# in tolerances it went on for a thousandth of one, four times as long.
-CLOSE = 1e-5
-UNIT = CLOSE / ROUNDING
-# Two iterations that come nearer by less than this share of the first distance, squared, are the last ones after others won more: close to
-# its goal the distance is so small beside the limits that SLSQP takes back every step for a thousandth of a tolerance, as long as it may.
-NEARER = 0.01
-# Below this share of it there is nothing left to go.
-ARRIVED = 1e-3
-# Where no linear program holds, SLSQP takes back every step until little is left of it, time and again.
-STUCK = 5e-4
+# A step that comes nearer by less than this share of the first distance, squared, is not worth its slopes; nor is one below this distance.
+NEARER, ARRIVED = 0.01, 0.1
+# The first step may go all the way: most thetas that are looked for are near the best trial's, and far from what was aimed at.
+RADIUS = 1.0
+# A tolerance broken costs at first this share of the first distance, squared: at a higher price the way was left for limits that are broken
+# on it and not at its end.
+PRICE = 0.1
+# For least distances the price of a violation t is that of (PULL t)^2, far from its least.
+PULL = 1e-3
 
 
 def nearest(
@@ -49,65 +43,74 @@ def nearest(
     """The theta nearest to ``best``, the best trial's, that promises an objective of ``promised``, as ``start`` about does.
 
     min |u - u_best|^2 in the unit cube  s.t.  objective >= promised, less the share `GAIN` of its size, and
-    excess <= allowed at every sample, by its window, in tolerances beyond the tolerance (`windows_of`), by SLSQP with finite differences.
+    excess <= allowed at every sample, by its window, in tolerances beyond the tolerance (`windows_of`), by least distances (`corner`).
 
     A change is a step into what has not been seen: entries that what is aimed at does not need stay where they were tried.
     ``search`` simulates the expected plant, so that ``allowed`` is to hold the margins. Where no point is found it is ``start``.
     """
     first, to = space.to_unit(start), space.to_unit(best)
-    known = search.samples(first)
-    if known is None:
-        return start
-    count = known[0].size
+    whole = max(float(np.linalg.norm(first - to)), ARRIVED)
     worth = GAIN * abs(promised) or GAIN
     seen: dict[bytes, float] = {}
 
-    def left(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is left to every sample, in tolerances, and to the objective, in what a risk is worth."""
+    def point(u: NDArray[np.float64]) -> Point | None:
+        """The distance, squared; what every sample is beyond what it may, in tolerances, and the objective, in what a risk is worth."""
         score, samples = search.score(u), search.samples(u)
-        if score is None or samples is None or samples[0].size != count:
-            return np.full(count + 1, -FAR)
+        if score is None or samples is None:
+            return None
         excess, window = samples
-        room = np.nan_to_num(allowed[window] - excess, nan=FAR)
-        return np.append(np.clip(room, -FAR, FAR), (score.objective - promised) / worth + 1.0)
+        # What nothing is known of, or is allowed anything, is no row.
+        beyond = np.nan_to_num(excess - allowed[window], nan=-np.inf)
+        distance = float(np.sum((u - to) ** 2)) / whole**2
+        # What a step wins is seen beside where it began.
+        found = Point(1.0 + distance, np.append(beyond, (promised - score.objective) / worth - 1.0))
+        if found.violation <= ROUNDING:
+            seen[np.clip(u, 0.0, 1.0).tobytes()] = distance
+        return found
 
-    def constraint(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = left(u)
-        if float(np.min(values)) >= -ROUNDING:
-            seen[np.clip(u, 0.0, 1.0).tobytes()] = float(np.sum((u - to) ** 2))
-        return UNIT * values
+    def points(us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
+        search.scores(us)
+        return [point(u) for u in us]
 
-    def slopes(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        steps = np.where(u + STEP <= 1.0, STEP, -STEP)
-        around = [u + step for step in np.diag(steps)]
-        search.scores(around)
-        values, beyond = left(u)[:, None], np.stack([left(ahead) for ahead in around], axis=1)
-        # A sample that enters or leaves a window that nothing is known of has no slope.
-        return UNIT * np.where((values == FAR) | (beyond == FAR), 0.0, beyond - values) / steps
-
-    way, nearer = [first], [float(np.sum((first - to) ** 2))]
-
-    def follow(u: NDArray[np.float64]) -> None:
-        way.append(np.array(u))
-        nearer.append(min(seen.values(), default=np.inf))
-        before, worth = nearer[-3:][0], NEARER * nearer[0]
-        arrived = nearer[-1] <= ARRIVED * nearer[0]
-        if arrived or np.max(np.abs(way[-1] - way[-2])) < STUCK or nearer[0] - before >= worth > before - nearer[-1]:
-            raise StopIteration
-
-    # Older SciPy lets it through, newer ends there.
-    with suppress(StopIteration):
-        minimize(
-            lambda u: 0.5 * float(np.sum((u - to) ** 2)),
-            first,
-            jac=lambda u: u - to,
-            method="SLSQP",
-            bounds=[(max(0.0, low - ASIDE), min(1.0, high + ASIDE)) for low, high in np.sort([first, to], axis=0).T],
-            constraints=[{"type": "ineq", "fun": constraint, "jac": slopes}],
-            options={"maxiter": ITERATIONS, "ftol": CLOSE},
-            callback=follow,
-        )
-    for share in PARTS:
-        constraint(first + share * (way[-1] - first))
+    corner(points, first, ITERATIONS, NEARER, ROUNDING, _LeastDistance(to, whole))
     found = min(seen, key=lambda key: seen[key], default=None)
     return start if found is None else space.from_unit(np.frombuffer(found))
+
+
+@dataclass(frozen=True)
+class _LeastDistance:
+    """1 + |u - to|^2 within the lines; ``whole`` is 1.
+
+    Source: Lawson and Hanson, Solving Least Squares Problems (1995), section 23.4, least distance programming.
+    """
+
+    to: NDArray[np.float64]
+    whole: float
+    radius: ClassVar[float] = RADIUS
+    price: ClassVar[float] = PRICE
+    least: ClassVar[float] = 1.0
+
+    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+        """min |u + d - to|^2 + rho t + (PULL t)^2  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
+
+        With s = PULL t it is the least distance of (d, s) to (to - u, -rho / (2 PULL)).
+        """
+        size = lines.u.size
+        rows, jacobian = lines.near(radius, bent)
+        low, high = lines.room(radius)
+        aim = np.append((self.to - lines.u) / self.whole, -price / (2 * PULL))
+        sides = np.eye(size, size + 1)
+        kept = np.column_stack([-self.whole * jacobian, np.full(rows.size, 1 / PULL)])
+        matrix = np.vstack([kept, np.eye(1, size + 1, size), sides, -sides])
+        least = np.concatenate([rows, [0.0], low / self.whole, -high / self.whole]) - matrix @ aim
+        # min |z| s.t. G z >= h:  with w >= 0 of least |[G'; h'] w - (0, 1)|, and r the residual there, z_j = -r_j / r_last.
+        every = np.vstack([matrix.T, least]) / np.linalg.norm(matrix, axis=1)
+        weights, _ = nnls(every, np.append(np.zeros(size + 1), 1.0))
+        residual = every @ weights
+        residual[-1] -= 1.0
+        found = aim - residual[:-1] / residual[-1]
+        return np.clip(self.whole * found[:size], low, high), max(0.0, float(found[size]) / PULL)
+
+    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+        before, after = lines.u - self.to, lines.u + step - self.to
+        return float(before @ before - after @ after) / self.whole**2
