@@ -180,9 +180,28 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
     ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5)
     aims = [ask.candidate(np.full(9, level)) for level in (1.6, 1.2, 1.0, 0.1)]
     assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
-    found = [ask._furthest(theta, aim) for aim in aims]
+    found = [ask._furthest(theta, aim, ask._safe) for aim in aims]
     assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, 1.9]
-    assert ask._furthest(np.full(9, 1.5), aims[-1]) is None
+    assert ask._furthest(np.full(9, 1.5), aims[-1], ask._safe) is None
+
+
+def test_where_every_draw_keeps_a_limit_by_little_it_is_not_sure():
+    problem = charge(noise=0.0)
+    loop, theta = ChargingTwin(problem), np.full(9, 2.5)
+    score, episode, _ = problem(theta, 0)
+    trials = [told(0, theta, score, episode)]
+    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5)
+    start, near = ask.candidate(theta), ask.candidate(np.full(9, 1.6))
+    mean, sd = near[1].upper_windows(0.0), near[1].upper_windows(1.0) - near[1].upper_windows(0.0)
+    # As many standard deviations as the first window has up to its tolerance.
+    most = float(np.nanmin(-mean / sd))
+    assert near[1].probability() == 1.0
+    assert most > 2.0
+    assert ask._as_sure(start, 0.99 * most)(near)
+    assert not ask._as_sure(start, 1.01 * most)(near)
+    # What is apart by more itself is no less sure than it.
+    assert ask._as_sure(near, 1.01 * most)(near)
+    assert not ask._as_sure(start, 0.0)(ask.candidate(np.full(9, 1.2)))
 
 
 def test_searches_lead_from_a_safe_theta_to_better_ones():

@@ -18,7 +18,8 @@ __all__ = ["nearest"]
 
 # A change of theta that promises less than this share of the objective is not worth a risk.
 GAIN = 1e-3
-ITERATIONS = 8
+# From the best trial's theta, where slopes are those of what is near, and where that leads nowhere from what was aimed at.
+ITERATIONS_NEAR, ITERATIONS = 3, 8
 # A search ends a little on the wrong side: of a tolerance, and of the gain.
 ROUNDING = 0.1
 # A step that comes nearer by less than this share of the first distance, squared, is not worth its slopes; nor is one below this distance.
@@ -72,7 +73,9 @@ def nearest(
         search.scores(us)
         return [point(u) for u in us]
 
-    corner(points, first, ITERATIONS, NEARER, ROUNDING, _LeastDistance(to, whole))
+    for begin, iterations in ((to, ITERATIONS_NEAR), (first, ITERATIONS)):
+        if not seen:
+            corner(points, begin, iterations, NEARER, ROUNDING, _LeastDistance(to, whole))
     found = min(seen, key=lambda key: seen[key], default=None)
     return start if found is None else space.from_unit(np.frombuffer(found))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import ClassVar
@@ -84,6 +85,14 @@ class SafeAsk(Ask):
     def _safe(self, candidate: Candidate) -> bool:
         return candidate[1].probability() >= self.safety.probability
 
+    def _as_sure(self, candidate: Candidate, deviations: float) -> Callable[[Candidate], bool]:
+        """Whether others are safe and no less sure than this one, a limit of which less than its tolerance is used apart.
+
+        How many of few draws keep a limit is coarse; how far the upper side of all is from it is not.
+        """
+        least = np.fmax(candidate[1].upper_windows(deviations), 0.0)
+        return lambda other: self._safe(other) and not np.any(other[1].upper_windows(deviations) > least)
+
     def _rounds(self, candidate: Candidate, deviations: float) -> list[Candidate]:
         """From a candidate on, thetas that are safe enough, by the objective expected of them."""
         theta = candidate[0]
@@ -118,7 +127,7 @@ class SafeAsk(Ask):
         found = [start]
         for _ in range(SEARCHES):
             aim = self.polished(found[0], deviations)
-            ahead = self._furthest(found[0][0], aim)
+            ahead = self._furthest(found[0][0], aim, self._as_sure(found[0], deviations))
             if ahead is None or self.as_good(found[0][0], ahead[0], WON):
                 break
             found.insert(0, ahead)
@@ -158,24 +167,26 @@ class SafeAsk(Ask):
         kept_back = np.nan_to_num(windows_of(score, AIMED) - windows_of(score))
         # Where this one keeps less than margin and aim another may too, and nowhere else.
         allowed = np.fmax(windows_of(score), -margin - kept_back)
-        near = theta
+        near, there, as_sure = theta, candidate, self._as_sure(candidate, deviations)
         for _ in range(NEARINGS):
-            near = nearest(search, self.space, known[0], near, score.objective, allowed)
+            near, before = nearest(search, self.space, known[0], near, score.objective, allowed), near
+            if near is before:
+                break
             there, expected = self.candidate(near), search.score(self.space.to_unit(near))
-            if self._safe(there):
+            if as_sure(there):
                 return near
             if expected is not None:
                 # It is less sure there, of some limits: those keep the margins of there.
                 allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)) - kept_back)
-        part = self._furthest(theta, there)
+        part = self._furthest(theta, there, as_sure)
         return theta if part is None else part[0]
 
-    def _furthest(self, theta: NDArray[np.float64], aim: Candidate) -> Candidate | None:
+    def _furthest(self, theta: NDArray[np.float64], aim: Candidate, safe: Callable[[Candidate], bool]) -> Candidate | None:
         """The aim where it is safe, else of the `PARTS` of the way there the longest that is; None where none is."""
-        if self._safe(aim):
+        if safe(aim):
             return aim
         parts = (self.candidate(theta + share * (aim[0] - theta)) for share in PARTS)
-        return next((part for part in parts if self._safe(part)), None)
+        return next((part for part in parts if safe(part)), None)
 
     def _kept(self) -> list[NDArray[np.float64]]:
         """The thetas that kept every limit as measured, the best first."""
