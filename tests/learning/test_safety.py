@@ -183,6 +183,10 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
     found = [ask._furthest(theta, aim, ask._safe) for aim in aims]
     assert [None if one is None else round(float(one[0][0]), 6) for one in found] == [1.6, 1.46, 1.75, 1.9]
     assert ask._furthest(np.full(9, 1.5), aims[-1], ask._safe) is None
+    # Where none is surer than safe it goes on, and does not propose what was tried again and again.
+    going = ask._furthest(theta, aims[1], lambda other: False)
+    assert going is not None
+    np.testing.assert_allclose(going[0], 1.46)
 
 
 def test_where_every_draw_keeps_a_limit_by_little_it_is_not_sure():

@@ -179,14 +179,17 @@ class SafeAsk(Ask):
                 # It is less sure there, of some limits: those keep the margins of there.
                 allowed = np.minimum(allowed, -np.nan_to_num(there[1].upper_windows(deviations) - windows_of(expected)) - kept_back)
         part = self._furthest(theta, there, as_sure)
-        return theta if part is None else part[0]
+        return theta if part is None or not as_sure(part) else part[0]
 
-    def _furthest(self, theta: NDArray[np.float64], aim: Candidate, safe: Callable[[Candidate], bool]) -> Candidate | None:
-        """The aim where it is safe, else of the `PARTS` of the way there the longest that is; None where none is."""
-        if safe(aim):
-            return aim
-        parts = (self.candidate(theta + share * (aim[0] - theta)) for share in PARTS)
-        return next((part for part in parts if safe(part)), None)
+    def _furthest(self, theta: NDArray[np.float64], aim: Candidate, sure: Callable[[Candidate], bool]) -> Candidate | None:
+        """The aim where it is sure, else of the `PARTS` of the way there the longest that is, else the longest that is safe, else None."""
+        safe = None
+        for share in (1.0, *PARTS):
+            part = aim if share == 1.0 else self.candidate(theta + share * (aim[0] - theta))
+            if sure(part):
+                return part
+            safe = part if safe is None and self._safe(part) else safe
+        return safe
 
     def _kept(self) -> list[NDArray[np.float64]]:
         """The thetas that kept every limit as measured, the best first."""
