@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import minimize
 
 from chargetune.episode.score import Score
-from chargetune.learning.nearest import GAIN, nearest
+from chargetune.learning.corner import Lines
+from chargetune.learning.nearest import GAIN, _LeastDistance, nearest
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import Parameter, ParameterSpace
 
@@ -136,3 +137,32 @@ def test_what_nothing_is_known_of_is_no_limit():
     for begin in (0.1, 0.499):
         found = nearest(found_by, space, np.array([0.8]), np.array([begin]), 1.0, np.array([0.0, np.nan]))
         assert found == pytest.approx(0.8, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_step_is_the_least_distance_within_the_lines(seed):
+    """Against SLSQP on the same quadratic program, without a violation and its price."""
+    draw = np.random.default_rng(seed)
+    u, to, jacobian = draw.uniform(0.3, 0.7, 6), draw.uniform(0.0, 1.0, 6), draw.standard_normal((40, 6))
+    # All are kept at u.
+    lines = Lines(u, -draw.uniform(0.0, 0.3, 40), np.zeros(6), jacobian)
+    step, left = _LeastDistance(to, 0.7).step(lines, 0.25, price=1e3)
+    low, high = lines.room(0.25)
+    kept = {"type": "ineq", "fun": lambda d: -lines.rows - jacobian @ d, "jac": lambda d: -jacobian}
+    other = minimize(
+        lambda d: float(np.sum((u + d - to) ** 2)), np.zeros(6), jac=lambda d: 2 * (u + d - to), method="SLSQP",
+        bounds=list(zip(low, high, strict=True)), constraints=kept, options={"ftol": 1e-14, "maxiter": 500},
+    )  # fmt: skip
+    assert other.success
+    np.testing.assert_allclose(step, other.x, rtol=0, atol=1e-6)
+    assert left == pytest.approx(0.0, abs=1e-6)
+    assert _LeastDistance(to, 0.7).falls(lines, step) == pytest.approx((np.sum((u - to) ** 2) - other.fun) / 0.49, abs=1e-6)
+
+
+def test_where_lines_cannot_be_kept_the_violation_has_its_price():
+    # d <= -0.3 and a radius of 0.1: at a high price as far as may be, for nothing not at all.
+    lines = Lines(np.array([0.5]), np.array([0.3]), np.zeros(1), np.array([[1.0]]))
+    for price, d in ((100.0, -0.1), (1e-6, 0.1)):
+        step, left = _LeastDistance(np.array([0.9]), 1.0).step(lines, 0.1, price)
+        assert step == pytest.approx(d, abs=1e-6)
+        assert left == pytest.approx(0.3 + d, rel=1e-3)

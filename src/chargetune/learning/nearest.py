@@ -29,8 +29,9 @@ RADIUS = 1.0
 # A tolerance broken costs at first this share of the first distance, squared: at a higher price the way was left for limits that are broken
 # on it and not at its end.
 PRICE = 0.1
-# For least distances the price of a violation t is that of (PULL t)^2, far from its least.
-PULL = 1e-3
+# For a least distance the price of a violation is the slope of a square, so far from its least: further ones are nearer to a line, and
+# to rounding.
+PULL = 50.0
 
 
 def nearest(
@@ -94,16 +95,16 @@ class _LeastDistance:
     least: ClassVar[float] = 1.0
 
     def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
-        """min |u + d - to|^2 + rho t + (PULL t)^2  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
+        """min |u + d - to|^2 + rho t + (rho t / 2 PULL)^2  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
 
-        With s = PULL t it is the least distance of (d, s) to (to - u, -rho / (2 PULL)).
+        With s = rho t / (2 PULL) it is the least distance of (d, s) to (to - u, -PULL).
         """
         size = lines.u.size
         rows, jacobian = lines.near(radius, bent)
         low, high = lines.room(radius)
-        aim = np.append((self.to - lines.u) / self.whole, -price / (2 * PULL))
+        aim = np.append((self.to - lines.u) / self.whole, -PULL)
         sides = np.eye(size, size + 1)
-        kept = np.column_stack([-self.whole * jacobian, np.full(rows.size, 1 / PULL)])
+        kept = np.column_stack([-self.whole * jacobian, np.full(rows.size, 2 * PULL / price)])
         matrix = np.vstack([kept, np.eye(1, size + 1, size), sides, -sides])
         least = np.concatenate([rows, [0.0], low / self.whole, -high / self.whole]) - matrix @ aim
         # min |z| s.t. G z >= h:  with w >= 0 of least |[G'; h'] w - (0, 1)|, and r the residual there, z_j = -r_j / r_last.
@@ -111,8 +112,8 @@ class _LeastDistance:
         weights, _ = nnls(every, np.append(np.zeros(size + 1), 1.0))
         residual = every @ weights
         residual[-1] -= 1.0
-        found = aim - residual[:-1] / residual[-1]
-        return np.clip(self.whole * found[:size], low, high), max(0.0, float(found[size]) / PULL)
+        step = np.clip(self.whole * (aim - residual[:-1] / residual[-1])[:size], low, high)
+        return step, float(np.max(rows + jacobian @ step, initial=0.0))
 
     def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
         before, after = lines.u - self.to, lines.u + step - self.to
