@@ -74,9 +74,11 @@ def nearest(
         search.scores(us)
         return [point(u) for u in us]
 
-    for begin, iterations in ((to, ITERATIONS_NEAR), (first, ITERATIONS)):
-        if not seen:
-            corner(points, begin, iterations, NEARER, ROUNDING, _LeastDistance(to, whole))
+    programme = _LeastDistance(to, whole)
+    if np.linalg.norm(first - to) > ARRIVED:
+        corner(points, to, ITERATIONS_NEAR, NEARER, ROUNDING, programme)
+    if not seen:
+        corner(points, first, ITERATIONS, NEARER, ROUNDING, programme)
     found = min(seen, key=lambda key: seen[key], default=None)
     return start if found is None else space.from_unit(np.frombuffer(found))
 
