@@ -3,6 +3,7 @@
 import itertools
 import os
 import shutil
+import signal
 import tempfile
 import warnings
 from pathlib import Path
@@ -13,6 +14,10 @@ from hypothesis import settings
 # Before the first import of numpy or torch: each test process has one core, and more threads would only fight for it.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+# A shell has it ignored by what it starts in the background, and no test of an interruption would pass there.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No deadline: the first call of an example may compile. Derandomised in CI: a run there depends on the commit alone.
 settings.register_profile("here", deadline=None)
