@@ -171,13 +171,18 @@ def test_a_trial_that_left_no_trace_does_not_have_the_start_judged_anew():
     assert tuner._safe_ask(problem.space, [told(0, problem.space.upper, score, episode)], tuner.safety).seed != 3
 
 
-def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_gone():
-    """After a charge with all nodes at 2.5, those at 1.4 are safe for sure and at 1.3 they are not at all."""
-    problem = charge(noise=0.0)
-    loop, theta = ChargingTwin(problem), np.full(9, 2.5)
+def after_one_charge():
+    """What is asked for after a charge with all nodes at 2.5, and that theta."""
+    problem, theta = charge(noise=0.0), np.full(9, 2.5)
+    loop = ChargingTwin(problem)
     score, episode, _ = problem(theta, 0)
     trials = [told(0, theta, score, episode)]
-    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5)
+    return SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5), theta
+
+
+def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_gone():
+    """After a charge with all nodes at 2.5, those at 1.4 are safe for sure and at 1.3 they are not at all."""
+    ask, theta = after_one_charge()
     aims = [ask.candidate(np.full(9, level)) for level in (1.6, 1.2, 1.0, 0.1)]
     assert [predicted.probability() for _, predicted in aims] == [1.0, 0.0, 0.0, 0.0]
     found = [ask._furthest(theta, aim, ask._safe) for aim in aims]
@@ -190,11 +195,7 @@ def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_g
 
 
 def test_where_every_draw_keeps_a_limit_by_little_it_is_not_sure():
-    problem = charge(noise=0.0)
-    loop, theta = ChargingTwin(problem), np.full(9, 2.5)
-    score, episode, _ = problem(theta, 0)
-    trials = [told(0, theta, score, episode)]
-    ask = SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5)
+    ask, theta = after_one_charge()
     start, near = ask.candidate(theta), ask.candidate(np.full(9, 1.6))
     mean, sd = near[1].upper_windows(0.0), near[1].upper_windows(1.0) - near[1].upper_windows(0.0)
     # As many standard deviations as the first window has up to its tolerance.

@@ -141,8 +141,10 @@ def corner(
             step, left = programme.step(lines, radius, price)
             promised = price * (here.violation - left) + programme.falls(lines, step)
             mended = price * (here.violation - left) if here.violation <= kept else 0.0
-            if promised - mended < gain * abs(here.objective) or radius < SHORTEST:
-                if here.violation <= kept or price >= dearest or radius < SHORTEST:
+            if radius < SHORTEST:
+                return u
+            if promised - mended < gain * abs(here.objective):
+                if here.violation <= kept or price >= dearest:
                     return u
                 price *= DEARER
                 continue
