@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from chargetune.episode.score import Score
-from chargetune.learning.corner import Lines
+from chargetune.learning.corner import Lines, Point, corner
 from chargetune.learning.nearest import GAIN, _LeastDistance, nearest
 from chargetune.learning.twin_search import Search
 from chargetune.model.parameters import Parameter, ParameterSpace
@@ -101,19 +101,41 @@ def test_it_is_as_near_as_another_solver_finds_from_many_starts():
     assert np.sum((found - best) ** 2) == pytest.approx(nearest_known, rel=0.02)
 
 
+def towards(to, start, row):
+    """From start to the nearest point to ``to`` that keeps one row, in one dimension."""
+    whole = abs(to - start) or 0.3
+
+    def points(us):
+        return [Point(1.0 + (float(u[0]) - to) ** 2 / whole**2, np.array([row(float(u[0]))])) for u in us]
+
+    return float(corner(points, np.array([start]), 8, 0.01, 0.01, _LeastDistance(np.array([to]), whole))[0])
+
+
 def test_limits_that_are_broken_on_the_way_and_not_at_its_end_do_not_end_it():
-    # Of 0.2 <= u0 <= 0.6 half a tolerance is missing in the middle: steps that keep the limit all the way end before it.
+    # Between 0.2 and 0.6 up to half a tolerance is missing: steps that keep the limit all the way end before it.
     def hill(u):
-        return 0.5 * np.sin(np.pi * np.clip((u[0] - 0.2) / 0.4, 0.0, 1.0)) ** 2
+        return 0.5 * np.sin(np.pi * np.clip((u - 0.2) / 0.4, 0.0, 1.0)) ** 2
 
-    def score(u):
-        return Score(1.0, 1.0, {"limit": hill(u)}, {"limit": 1.0})
+    assert towards(0.4, 0.65, hill) == pytest.approx(0.6, abs=0.05)
+    assert towards(0.15, 0.65, hill) == pytest.approx(0.15, abs=0.01)
 
-    loop = SimpleNamespace(score=score, samples=lambda u: {"limit": (np.array([hill(u)]), np.zeros(1, dtype=int))})
-    space = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5, size=2),))
-    found_by = Search(loop, lambda thetas: [space.to_unit(theta) for theta in thetas], space)
-    found = nearest(found_by, space, np.array([0.15, 0.5]), np.array([0.65, 0.5]), 1.0, np.array([-1.0]))
-    np.testing.assert_allclose(found, [0.15, 0.5], rtol=0, atol=1e-6)
+
+def test_a_limit_that_is_dearer_to_mend_than_its_price_is_mended():
+    # Three tenths of a tolerance cost all of the distance, of which they are worth a hundredth at first.
+    assert towards(0.8, 0.8, lambda u: u - 0.5) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_row_that_becomes_known_within_a_step_of_the_differences_has_no_slope():
+    for start in (0.1, 0.4995):
+        assert towards(0.8, start, lambda u: -np.inf if u < 0.5 else u - 0.9) == pytest.approx(0.8, abs=0.01)
+
+
+def test_where_the_best_trial_promises_as_much_nothing_else_is_simulated():
+    found_by, space, simulated = bent_search()
+    best = np.full(11, 0.5)
+    start = best - np.linspace(0.1, 0.3, 11)
+    np.testing.assert_array_equal(nearest(found_by, space, best, start, float(start.sum()), np.full(11, -1.0)), best)
+    assert len(simulated) == 1
 
 
 def test_from_where_limits_are_broken_it_mends_them_first():
@@ -121,22 +143,6 @@ def test_from_where_limits_are_broken_it_mends_them_first():
     start = np.full(11, 0.52)
     found = nearest(found_by, space, start + 0.01, start, 0.9 * start.sum(), np.full(11, -1.0))
     np.testing.assert_allclose(found, 0.5, rtol=0, atol=1e-3)
-
-
-def test_what_nothing_is_known_of_is_no_limit():
-    # The second window is entered where u0 is above 0.5 alone, and nan says that nothing is known of it.
-    def samples(u):
-        return {"limit": (np.array([u[0] - 0.9, 9.0 if u[0] > 0.5 else np.nan]), np.arange(2))}
-
-    def score(u):
-        return Score(1.0, 1.0, {"limit": float(u[0] - 0.9)}, {"limit": 0.01}, profile={"limit": (float(u[0] - 0.9), None)})
-
-    loop = SimpleNamespace(score=score, samples=samples)
-    space = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5, size=1),))
-    found_by = Search(loop, lambda thetas: [space.to_unit(theta) for theta in thetas], space)
-    for begin in (0.1, 0.499):
-        found = nearest(found_by, space, np.array([0.8]), np.array([begin]), 1.0, np.array([0.0, np.nan]))
-        assert found == pytest.approx(0.8, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
