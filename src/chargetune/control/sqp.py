@@ -30,7 +30,7 @@ KKT_TOLERANCE = 1e-4
 HALVINGS_MAX = 6
 # Iterations from this one on take the curvature of constraints and dynamics into account. Gauss-Newton steps are cheaper and
 # mostly converge in one or two; along a limit that is bent in the input, as that of a temperature is, they go back and forth.
-CURVED_FROM = 3
+CURVED_FROM = 2
 # Violations of this share of a limit's scale come from the QP solver's own tolerance.
 MERIT_ROUNDING = 1e-9
 

@@ -4,26 +4,42 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
-
-from chargetune.episode.cores import each
 
 if TYPE_CHECKING:
     from chargetune.learning.twin import Twin
 
 __all__ = ["Posterior"]
 
-# Steps by which a draw is brought to what it should predict; twice the loss of log-likelihood at which it may stay, and at which it is
-# there: another step would not be seen in the data.
-CHORDS, MISFIT, THERE = 6, 9.0, 0.3
-# A step that wins less of it was the last one.
-LITTLE = 0.05
-# The slopes at a draw serve the next step too when the last one left less than this share of the loss.
-KEPT = 0.2
+# Steps by which a draw is brought to where it should be, and what of its equation, in squared standard deviations, may be left there:
+# another step would not be seen in the data.
+STEPS, THERE = 8, 0.05
+# Twice the loss of log-likelihood at which a draw may be there.
+MISFIT = 9.0
+# After a step that was not taken the next one is so much shorter.
+SHORTER = 0.3
+# Halvings of a draw that may not be where it was brought to.
+HALVINGS = 2
+# Where a factor would fall below this share of what it is at the mode, its logarithm goes on as a straight line.
+STRAIGHT = 0.5
+
+
+class _Led(NamedTuple):
+    """Draws on their way (`Posterior._at`), each entry with the draws as its first axis."""
+
+    misfit: NDArray[np.float64]
+    """Twice the loss of log-posterior, (count,)."""
+    pull: NDArray[np.float64]
+    """What is left of the equation, (count, d)."""
+    left: NDArray[np.float64]
+    """Its square in the metric of the posterior, (count,): that of the distance to where it is solved, were the model linear."""
+    slope: NDArray[np.float64]
+    """dm/dx, (count, d)."""
+    grown: NDArray[np.float64]
+    """By which the slopes at the mode become those with respect to x, about, (count, d)."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +68,15 @@ class Posterior:
         """Unknowns of ``count`` plants that the data allow, shape (count, d).
 
         A Gaussian draw of two resistances in series whose sum alone is known misses the sum, because it is not linear in their
-        logarithms. So each draw m' is moved to where what it predicts is what it would predict if the model were linear:
+        logarithms. So each draw m' is moved to where
 
-            min over m  |y(m) - y(mode) - J (m' - mode)|^2 + |m - m'|^2
+            J'W (y(m) - y(mode) - J (m' - mode)) + S^-1 (m - m') = 0,
 
-        in the metrics of likelihood and prior, J the slopes at the mode (randomise, then optimise; Bardsley et al., SIAM J. Sci.
-        Comput. 36 (2014) A1895): steps with the mode's slopes, with its own where these do not lead there. A draw that
-        neither brings below `MISFIT` is halved towards the mode.
+        J the slopes at the mode, W and S the metrics of likelihood and prior: what it predicts is then, as far as the data tell, what it
+        would predict if the model were linear (randomise, then optimise; Bardsley et al., SIAM J. Sci. Comput. 36 (2014) A1895).
+        Predictions are more nearly linear in a factor than in its logarithm, so the steps are taken in factors: they begin where
+        these, instead of their logarithms, have changed by m' - mode, and the slopes of the mode serve all of them. A draw whose misfit
+        is not below `MISFIT` there is halved towards the mode.
         """
         normal = np.random.default_rng(seed).standard_normal((count, self.root.shape[1]))
         if not self.seen:
@@ -79,58 +97,43 @@ class Posterior:
 
     def moved(self, draws: NDArray[np.float64]) -> NDArray[np.float64]:
         """The mode and Gaussian draws of the difference from it -> unknowns that predict what they should (`draw`), both (count, d)."""
-        m, misfit = self._along(draws)
-        there = misfit < MISFIT
-        # What led nowhere is shorter from the start.
-        left = np.where(np.isfinite(misfit)[:, None], 1.0, 0.5) * draws
-        m[~there] = np.array(each(self._led, left[~there])).reshape(-1, self.mode.size)
-        return m
+        m, misfit = self._led(draws)
+        for _ in range(HALVINGS):
+            # A misfit that is no number is none to stay with either.
+            far = ~(misfit < MISFIT)
+            if not far.any():
+                break
+            draws = np.where(far[:, None], 0.5 * draws, draws)
+            m[far], misfit[far] = self._led(draws[far])
+        return np.where(misfit[:, None] < MISFIT, m, self.mode + draws)
 
-    def _along(self, draws: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where steps with the mode's slopes lead, and the misfit there, shapes (count, d) and (count,); all draws at once."""
-        m, wanted = self.mode + draws, self._wanted(draws)
-        misfit, pull = self._misfit(m, draws, wanted)
-        going, inverse = np.flatnonzero(np.isfinite(misfit)), self.covariance
-        for _ in range(CHORDS):
+    def _led(self, draws: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where steps lead draws, all at once, and the misfit there, shapes (count, d) and (count,)."""
+        x, wanted, length = draws.copy(), self._wanted(draws), np.ones(len(draws))
+        now = self._at(x, draws, wanted)
+        going = np.flatnonzero(np.isfinite(now.left) & (now.left >= THERE))
+        for _ in range(STEPS):
             if not going.size:
                 break
-            ahead = m[going] - pull[going] @ inverse
-            other, following = self._misfit(ahead, draws[going], wanted[going])
-            gain = misfit[going] - other
-            better = gain > 0.0
-            at = going[better]
-            m[at], misfit[at], pull[at] = ahead[better], other[better], following[better]
-            going = at[(gain[better] >= LITTLE) & (other[better] >= THERE)]
-        return m, misfit
+            slopes = self._seen_curvature * now.grown[going, None, :] + self._precision * now.slope[going, None, :]
+            ahead = x[going] - length[going, None] * np.linalg.solve(slopes, now.pull[going, :, None])[..., 0]
+            following = self._at(ahead, draws[going], wanted[going])
+            # What is not finite is not nearer.
+            nearer = following.left < now.left[going]
+            at, stayed = going[nearer], going[~nearer]
+            x[at] = ahead[nearer]
+            for values, others in zip(now, following, strict=True):
+                values[at] = others[nearer]
+            length[at], length[stayed] = 1.0, SHORTER * length[stayed]
+            going = np.concatenate([at[now.left[at] >= THERE], stayed])
+        return self._moved_by(x)[0], now.misfit
 
-    def _led(self, draw: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where steps with their own slopes lead a single draw that those of the mode do not; halved where these do not either."""
-        for _ in range(2):
-            m, wanted = (self.mode + draw)[None], self._wanted(draw[None])
-            misfit, pull = self._misfit(m, draw, wanted)
-            curvature, fallen = None, 1.0
-            for _ in range(CHORDS if np.isfinite(misfit[0]) else 0):
-                if curvature is None or fallen > KEPT:
-                    slopes = self._curvature(m[0])
-                    if not np.all(np.isfinite(slopes)):
-                        break
-                    curvature = lu_factor(slopes)
-                step = lu_solve(curvature, pull[0])
-                for share in (1.0, 0.5, 0.25):
-                    ahead = m - share * step
-                    other, following = self._misfit(ahead, draw, wanted)
-                    if other[0] < misfit[0]:
-                        break
-                else:
-                    break
-                gain, fallen = misfit[0] - other[0], other[0] / misfit[0]
-                m, misfit, pull = ahead, other, following
-                if gain < LITTLE or misfit[0] < THERE:
-                    break
-            if misfit[0] < MISFIT:
-                return np.asarray(m[0])
-            draw = draw * 0.5
-        return self.mode + draw
+    def _moved_by(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Unknowns whose factors are 1 + x times those of the mode, and the others x more than there; and dm/dx, both (count, d)."""
+        # Below STRAIGHT the tangent: a factor has no logarithm at 0, and draws of what is hardly known go there.
+        at = np.maximum(x, STRAIGHT - 1.0)
+        slope = np.where(self.twin.factors, 1.0 / (1.0 + at), 1.0)
+        return self.mode + np.where(self.twin.factors, np.log1p(at) + slope * (x - at), x), slope
 
     @cached_property
     def _weight(self) -> NDArray[np.float64]:
@@ -164,21 +167,28 @@ class Posterior:
     def _precision(self) -> NDArray[np.float64]:
         return np.asarray(np.linalg.inv(self.twin.prior_factor @ self.twin.prior_factor.T))
 
-    def _misfit(
-        self, m: NDArray[np.float64], draw: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What `draw` minimises at each m, and half its gradient with the slopes of the mode, shapes (count,) and (count, d)."""
-        away = m - self.mode - draw
-        pull = away @ self._precision
-        # A long step may lead where outputs are not finite: their misfit is nan, which is smaller than none, and it is not taken.
-        with np.errstate(invalid="ignore", over="ignore"):
-            left = self._predicted(m) - wanted
-            return np.sum(away * pull, axis=1) + np.sum(left**2, axis=1), pull + left @ self._at_mode[1]
+    @cached_property
+    def _seen_curvature(self) -> NDArray[np.float64]:
+        """J'WJ of what was seen, at the mode, shape (d, d)."""
+        return np.asarray(self._at_mode[1].T @ self._at_mode[1])
 
-    def _curvature(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """J'J of the whitened residuals at m, in the metric of the slopes that `_misfit` pulls with."""
+    @cached_property
+    def _laplace(self) -> NDArray[np.float64]:
+        """(J'WJ + S^-1)^-1 at the mode, shape (d, d)."""
+        return np.asarray(np.linalg.inv(self._seen_curvature + self._precision))
+
+    def _at(self, x: NDArray[np.float64], draws: NDArray[np.float64], wanted: NDArray[np.float64]) -> _Led:
+        """Draws that should predict ``wanted`` at x (`_moved_by`), all of shape (count, d)."""
+        m, slope = self._moved_by(x)
+        away = m - self.mode - draws
+        pull = away @ self._precision
+        # A long step may lead where outputs are not finite.
         with np.errstate(invalid="ignore", over="ignore"):
-            return np.asarray(self._precision + self._at_mode[1].T @ self._slopes(m))
+            off = self._predicted(m) - wanted
+            misfit = np.sum(away * pull, axis=1) + np.sum(off**2, axis=1)
+            pull += off @ self._at_mode[1]
+            grown = slope * np.where(self.twin.factors, np.exp(m - self.mode), 1.0)
+            return _Led(misfit, pull, np.sum((pull @ self._laplace) * pull, axis=1), slope, grown)
 
     def predicted_sd(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviation of a new noisy sample of each measured output under ``inputs``, shape (K, 2, outputs): by linearisation."""

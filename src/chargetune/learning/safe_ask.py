@@ -46,7 +46,7 @@ WIDER = 1.25
 # Searches, each with the margins of what the one before found.
 SEARCHES = 3
 # Times that the nearest theta that promises as much is looked for, each time with the margins of the one before.
-NEARINGS = 3
+NEARINGS = 2
 # Of the way to what is aimed at where that is not safe, the shares that are tried; the first that is safe is taken.
 PARTS = (0.8, 0.5, 0.25)
 

@@ -145,6 +145,11 @@ class Twin:
         return [int(at) for at, size in zip(np.cumsum([0, *self.sizes[:-1]]), self.sizes, strict=True) if size == 1]
 
     @cached_property
+    def factors(self) -> NDArray[np.bool_]:
+        """Which of the unknowns m are logarithms of factors, shape (d,)."""
+        return np.repeat([one.kind == "factor" for one in self.unknowns], self.sizes)
+
+    @cached_property
     def prior_factor(self) -> NDArray[np.float64]:
         """Lower Cholesky factor of the prior covariance S, shape (d, d)."""
         out = np.zeros((sum(self.sizes), sum(self.sizes)))
