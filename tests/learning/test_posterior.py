@@ -55,6 +55,17 @@ def test_draws_solve_their_equation_as_another_solver_does(posterior):
     assert np.mean(np.array(unmoved) > LEFT) >= 0.9
 
 
+def test_in_factors_a_draw_begins_nearer_than_in_logarithms(posterior):
+    """What a draw begins at is as far from the solution as the data are from linear in what is drawn."""
+    draws = np.random.default_rng(2).standard_normal((24, posterior.root.shape[1])) @ posterior.root.T
+    begun, _ = posterior._moved_by(draws)
+    in_factors, in_logarithms = (
+        [np.sum(equation(posterior, draw)(m) ** 2) for draw, m in zip(draws, starts, strict=True)]
+        for starts in (begun, posterior.mode + draws)
+    )
+    assert np.median(in_factors) < 0.5 * np.median(in_logarithms)
+
+
 def test_a_draw_that_may_not_be_where_it_is_brought_to_is_halved(posterior, monkeypatch):
     draws = np.random.default_rng(2).standard_normal((4, posterior.root.shape[1])) @ posterior.root.T
     whole, half = posterior.moved(draws), posterior.moved(0.5 * draws)

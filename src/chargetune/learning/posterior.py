@@ -17,7 +17,7 @@ __all__ = ["Posterior"]
 # Steps by which a draw is brought to where it should be, and what of its equation, in squared standard deviations, may be left there:
 # another step would not be seen in the data.
 STEPS, THERE = 8, 0.05
-# Twice the loss of log-likelihood at which a draw may be there.
+# Twice the loss of log-posterior at which a draw may be there.
 MISFIT = 9.0
 # After a step that was not taken the next one is so much shorter.
 SHORTER = 0.3
