@@ -1,9 +1,12 @@
 """A short run of benchmarks/learning.py and of its figures: the keys that it promises, and what must hold for any run."""
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 KEYS = {
@@ -12,26 +15,31 @@ KEYS = {
 }  # fmt: skip
 
 
-def run(*arguments):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, check=False)
+def run(script, *arguments):
+    """As a user runs it."""
+    return subprocess.run([sys.executable, BENCHMARKS / script, *map(str, arguments)], capture_output=True, text=True, check=False)
 
 
-def test_a_short_run_and_its_figure(tmp_path):
+@pytest.fixture
+def run_here(monkeypatch, capsys):
+    """The same in this process, which has imported everything: what a script exits with and what it says on stderr."""
+
+    def runs(script, *arguments):
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        code = None
+        try:
+            runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+        except SystemExit as ended:
+            code = ended.code
+        return code, capsys.readouterr().err
+
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return runs
+
+
+def test_a_short_run_and_its_figure(tmp_path, run_here):
     cache = tmp_path / "attainable.json"
-    done = run(
-        BENCHMARKS / "learning.py",
-        "--study",
-        "r0",
-        "--methods",
-        "safe,sobol",
-        "--seeds",
-        "1:2",
-        "--trials",
-        "2",
-        "--json",
-        "--cache",
-        cache,
-    )
+    done = run("learning.py", "--study", "r0", "--methods", "safe,sobol", "--seeds", "1:2", "--trials", 2, "--json", "--cache", cache)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
     assert len(rows) == 4
@@ -44,12 +52,10 @@ def test_a_short_run_and_its_figure(tmp_path):
 
     printed, figure = tmp_path / "rows.json", tmp_path / "learning.png"
     printed.write_text(done.stdout)
-    done = run(BENCHMARKS / "learning_figures.py", printed, "--out", figure)
-    assert done.returncode == 0, done.stderr
+    assert run_here("learning_figures.py", printed, "--out", figure) == (None, "")
     assert figure.read_bytes().startswith(b"\x89PNG")
     printed.write_text("{}")
-    done = run(BENCHMARKS / "learning_figures.py", printed, "--out", figure)
-    assert done.returncode == 1
-    assert "rows.json: expected is what learning.py --json prints" in done.stderr
-    done = run(BENCHMARKS / "learning.py", "--methods", "guess")
-    assert "unknown ['guess'], allowed are" in done.stderr
+    said, _ = run_here("learning_figures.py", printed, "--out", figure)
+    assert "rows.json: expected is what learning.py --json prints" in said
+    said, _ = run_here("learning.py", "--methods", "guess")
+    assert "unknown ['guess'], allowed are" in said

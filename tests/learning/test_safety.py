@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from two_pairs import AnotherCell, TwoPairs
 
 from chargetune.battery.cell import default_cell
@@ -214,6 +215,8 @@ def test_searches_lead_from_a_safe_theta_to_better_ones():
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     trials, _, _ = learn(problem, tuner, 3)
     ask = tuner._safe_ask(problem.space, trials, tuner.safety)
+    # The first trial was foretold by none.
+    assert ask.belief.foretold == 2
     begin = ask.candidate(ask._expected_best())
     deviations = ask._deviations(begin)
     # The best theta on the expected plant breaks a limit on most plants; the searches begin at one far from it.
@@ -247,14 +250,26 @@ def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_d
     assert len(seen) > 2
 
 
+def deviations_after(foretold, near):
+    """What is kept back when so many trials were foretold and so many windows are near their limit."""
+    ask = SafeAsk(None, None, SimpleNamespace(foretold=foretold), [], 0, Safety(probability=0.9), 5)
+    windows = np.array([0.2] * near + [-0.5] * 20 + [np.nan])
+    return ask._deviations((None, SimpleNamespace(upper_windows=lambda _: windows)))
+
+
 @pytest.mark.parametrize("near", [0, 1, 3, 10])
 def test_as_many_deviations_are_kept_back_as_the_windows_that_may_break_need_together(near):
     """Monte Carlo: independent windows, each so many standard deviations below its limit, are all kept with the stated probability."""
-    ask = SafeAsk(None, None, SimpleNamespace(proved=True), [], 0, Safety(probability=0.9), 5)
-    windows = np.array([0.2] * near + [-0.5] * 20 + [np.nan])
-    deviations = ask._deviations((None, SimpleNamespace(upper_windows=lambda _: windows))) - safe_ask.BEYOND
+    deviations = deviations_after(1, near) - safe_ask.BEYOND
     kept = np.all(np.random.default_rng(near).standard_normal((100_000, max(near, 1))) <= deviations, axis=1)
     assert kept.mean() == pytest.approx(0.9, abs=0.005)
+
+
+def test_less_is_kept_back_the_more_trials_were_foretold_and_never_less_than_the_quantile():
+    kept_back = [deviations_after(foretold, 3) for foretold in range(4)]
+    assert kept_back == sorted(kept_back, reverse=True)
+    assert len(set(kept_back)) == 4
+    assert kept_back[-1] > norm.ppf(0.9 ** (1 / 3))
 
 
 def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():

@@ -81,9 +81,14 @@ class Belief:
     mistake: float = 0.0
 
     @property
+    def foretold(self) -> int:
+        """How many of the traces learnt from were foretold by those before them."""
+        return len(self.discrepancy.episodes) - 1 if self.discrepancy else 0
+
+    @property
     def proved(self) -> bool:
         """Whether there is a trial that those before it foretold."""
-        return self.discrepancy is not None and len(self.discrepancy.episodes) > 1
+        return self.foretold > 0
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""

@@ -37,7 +37,8 @@ SETTLED = 5e-3
 UNCHANGED, UNCHANGED_UNPROVED = 3e-3, 1e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
-# Beyond the quantile for these windows together: draws are few, and not Gaussian.
+# Beyond the quantile for these windows together: draws are few, and not Gaussian. The more trials were foretold by those before them the
+# more of it is proved needless: it is divided by their number.
 BEYOND = 0.5
 # Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
@@ -142,7 +143,8 @@ class SafeAsk(Ask):
         """
         near = int(np.sum(candidate[1].upper_windows(NEAR) > 0))
         together = float(norm.ppf(self.safety.probability ** (1 / max(near, 1))))
-        return together + BEYOND + (0.0 if self.belief.proved else UNPROVED)
+        foretold = self.belief.foretold
+        return together + (BEYOND / foretold if foretold else BEYOND + UNPROVED)
 
     def _expected_best(self) -> NDArray[np.float64]:
         """What the plant would allow if the belief were true: from there on caution only takes back."""
