@@ -2,6 +2,8 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
+# Lint, types and imports beside each other.
+MAKEFLAGS += --jobs=2
 
 PYTHON ?= python3
 # Package index of PyTorch's CPU builds, for machines where pip would otherwise choose a CUDA build (README, Set-up).
