@@ -21,7 +21,8 @@ WAYS = {
     "step by step": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta),
     "IPOPT": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta, control=ipopt_act),
 }
-# IPOPT takes a hundred times as long, and mismatches of one kind ask nothing new of it: one of each kind, one of them with a backoff.
+# IPOPT takes a hundred times as long: one mismatch with a backoff and a measured U1, one with the controller's own U1. A right model
+# (oracle) asks nothing of it that these do not.
 BY_IPOPT = ("seed0-backoff", "seed0-model-U1")
 
 
