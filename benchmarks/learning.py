@@ -19,6 +19,7 @@ import json
 import sys
 import time
 import warnings
+from collections.abc import Callable, Collection
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -204,11 +205,18 @@ def main() -> None:
     args = arguments()
     attainable = optima(args)
     jobs = list(product(args.methods, args.seeds))
-    work = partial(run, args.plant, args.study, args.noise_mV / 1e3, args.trials)
+    report(rows(runs_of(partial(run, args.plant, args.study, args.noise_mV / 1e3, args.trials), jobs, args), args, attainable), args)
+
+
+def runs_of(work: Callable[[Any], dict[str, Any]], jobs: list[Any], args: argparse.Namespace) -> list[dict[str, Any]]:
+    """What every job gives, on so many processes, with a bar where somebody sees it."""
     screen = Console(stderr=True)
     with ProcessPoolExecutor(args.workers) as pool:
-        runs = list(track(pool.map(work, jobs), "learning", total=len(jobs), console=screen, disable=args.json and not screen.is_terminal))
-    found = rows(runs, args, attainable)
+        return list(track(pool.map(work, jobs), "learning", total=len(jobs), console=screen, disable=args.json and not screen.is_terminal))
+
+
+def report(found: list[dict[str, Any]], args: argparse.Namespace) -> None:
+    """Rows as a table, or for a program."""
     if args.json:
         print(json.dumps({"rows": found}))
         return
@@ -245,11 +253,14 @@ def optima(args: argparse.Namespace) -> dict[int, float]:
     return {s: known[f"{args.plant} {args.study} {own[s]}"] for s in args.seeds}
 
 
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def arguments(
+    description: str | None = __doc__, known: Collection[str] = tuple(METHODS), methods: str = "safe,twin,ilc,default", **defaults: Any
+) -> argparse.Namespace:
+    """The command line; ``defaults`` of the options that another script has other ones of."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plant", choices=PLANTS, default="ecm")
     parser.add_argument("--study", choices=sorted(STUDIES), default="r0")
-    parser.add_argument("--methods", default="safe,twin,ilc,default", help=f"of {','.join(METHODS)}")
+    parser.add_argument("--methods", default=methods, help=f"of {','.join(known)}")
     parser.add_argument("--seeds", default="0:20", help="A:B, B not included")
     parser.add_argument("--trials", type=int, default=4)
     parser.add_argument("--noise-mV", dest="noise_mV", type=float, default=2.0)
@@ -257,11 +268,12 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, default=Path("out/learning/attainable.json"))
     parser.add_argument("--recompute", action="store_true", help="compute the attainable t95 anew")
     parser.add_argument("--json", action="store_true")
+    parser.set_defaults(**defaults)
     args = parser.parse_args()
     args.methods = args.methods.split(",")
-    unknown = sorted(set(args.methods) - set(METHODS))
+    unknown = sorted(set(args.methods) - set(known))
     if unknown:
-        sys.exit(f"methods: unknown {unknown}, allowed are {', '.join(METHODS)}")
+        sys.exit(f"methods: unknown {unknown}, allowed are {', '.join(known)}")
     first, _, last = args.seeds.partition(":")
     args.seeds = range(int(first), int(last or int(first) + 1))
     return args
