@@ -9,8 +9,6 @@ values of the package's own names while the trials of one seed run.
 from __future__ import annotations
 
 from contextlib import ExitStack
-from functools import partial
-from itertools import product
 from typing import Any
 from unittest.mock import patch
 
@@ -23,7 +21,7 @@ from chargetune.learning.discrepancy import Discrepancy, OutputError
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.safe_ask import SURE, SafeAsk
 from chargetune.learning.twin_search import Search
-from learning import arguments, optima, report, rows, run, runs_of
+from learning import arguments, measure, run
 
 _error = Discrepancy._error  # noqa: SLF001 - what is taken away has no public name
 
@@ -69,10 +67,7 @@ def without(plant: str, study: str, noise_V: float, trials: int, job: tuple[str,
 
 
 def main() -> None:
-    args = arguments(__doc__, PARTS, ",".join(PARTS), plant="structural", seeds="0:10")
-    attainable = optima(args)
-    work = partial(without, args.plant, args.study, args.noise_mV / 1e3, args.trials)
-    report(rows(runs_of(work, list(product(args.methods, args.seeds)), args), args, attainable), args)
+    measure(arguments(__doc__, PARTS, methods=",".join(PARTS), plant="structural", seeds="0:10"), without)
 
 
 if __name__ == "__main__":

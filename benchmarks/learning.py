@@ -202,21 +202,18 @@ def _number(value: float) -> float | None:
 
 
 def main() -> None:
-    args = arguments()
+    measure(arguments(), run)
+
+
+def measure(args: argparse.Namespace, one: Callable[..., dict[str, Any]]) -> None:
+    """Prints the rows of every method and seed; ``one`` runs one of them, as `run` does."""
     attainable = optima(args)
     jobs = list(product(args.methods, args.seeds))
-    report(rows(runs_of(partial(run, args.plant, args.study, args.noise_mV / 1e3, args.trials), jobs, args), args, attainable), args)
-
-
-def runs_of(work: Callable[[Any], dict[str, Any]], jobs: list[Any], args: argparse.Namespace) -> list[dict[str, Any]]:
-    """What every job gives, on so many processes, with a bar where somebody sees it."""
+    work = partial(one, args.plant, args.study, args.noise_mV / 1e3, args.trials)
     screen = Console(stderr=True)
     with ProcessPoolExecutor(args.workers) as pool:
-        return list(track(pool.map(work, jobs), "learning", total=len(jobs), console=screen, disable=args.json and not screen.is_terminal))
-
-
-def report(found: list[dict[str, Any]], args: argparse.Namespace) -> None:
-    """Rows as a table, or for a program."""
+        runs = list(track(pool.map(work, jobs), "learning", total=len(jobs), console=screen, disable=args.json and not screen.is_terminal))
+    found = rows(runs, args, attainable)
     if args.json:
         print(json.dumps({"rows": found}))
         return
@@ -253,14 +250,12 @@ def optima(args: argparse.Namespace) -> dict[int, float]:
     return {s: known[f"{args.plant} {args.study} {own[s]}"] for s in args.seeds}
 
 
-def arguments(
-    description: str | None = __doc__, known: Collection[str] = tuple(METHODS), methods: str = "safe,twin,ilc,default", **defaults: Any
-) -> argparse.Namespace:
-    """The command line; ``defaults`` of the options that another script has other ones of."""
+def arguments(description: str | None = __doc__, known: Collection[str] = tuple(METHODS), **defaults: str) -> argparse.Namespace:
+    """The command line; ``defaults`` where another script has other ones."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plant", choices=PLANTS, default="ecm")
     parser.add_argument("--study", choices=sorted(STUDIES), default="r0")
-    parser.add_argument("--methods", default=methods, help=f"of {','.join(known)}")
+    parser.add_argument("--methods", default="safe,twin,ilc,default", help=f"of {','.join(known)}")
     parser.add_argument("--seeds", default="0:20", help="A:B, B not included")
     parser.add_argument("--trials", type=int, default=4)
     parser.add_argument("--noise-mV", dest="noise_mV", type=float, default=2.0)
