@@ -59,3 +59,10 @@ def test_a_short_run_and_its_figure(tmp_path, run_here):
     assert "rows.json: expected is what learning.py --json prints" in said
     said, _ = run_here("learning.py", "--methods", "guess")
     assert "unknown ['guess'], allowed are" in said
+
+
+def test_every_part_that_is_taken_away_is_one(run_here):
+    parts = runpy.run_path(str(BENCHMARKS / "ablation.py"))["PARTS"]
+    assert all(hasattr(owner, name) for part in parts.values() for owner, name, _ in part)
+    said, _ = run_here("ablation.py", "--methods", "guess")
+    assert "unknown ['guess'], allowed are nothing, discrepancy" in said
