@@ -33,7 +33,7 @@ from learning_peers import CmaEs, Tpe
 from learning_plants import DFN, PLANTS, STUDIES, UnknownCell, exact, make_problem
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 
 from chargetune import learning
 from chargetune.battery.reproduce import tuned_trial
@@ -217,7 +217,18 @@ def measure(args: argparse.Namespace, one: Callable[..., dict[str, Any]]) -> Non
     if args.json:
         print(json.dumps({"rows": found}))
         return
-    table = Table("method", "trials", "solved", "t95 ratio median", "worst", "violating", "worst excess mV", "K", "anode mV", "ask s")
+    table = Table(
+        Column("method", no_wrap=True),
+        "trials",
+        "solved",
+        "t95 ratio median",
+        "worst",
+        "violating",
+        "worst excess mV",
+        "K",
+        "anode mV",
+        "ask s",
+    )
     for r in found:
         ratios = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("t95_ratio_median", "t95_ratio_worst")]
         violating = f"{r['violating_trials']}/{r['all_trials']}"
