@@ -1,5 +1,8 @@
 """The two QP paths against each other and against the optimality conditions."""
 
+import subprocess
+import sys
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -109,3 +112,39 @@ def test_rows_alone():
 def test_slacks_alone():
     _, dual = daqp_warm(2, 1, 1)(np.array([1.0, -2.0, 0.0]), np.array([0.0, 1.0, 0.0]), [-10], [10], np.zeros(3))
     np.testing.assert_allclose(np.array(dual).ravel(), [-1, 0, 0], atol=1e-12)
+
+
+# In a fresh process, because a thread whose stack is too small takes the whole process with it. No first guess.
+LARGE = """
+import threading
+import subprocess
+import sys
+
+import casadi as ca
+import numpy as np
+from chargetune.control.qp import daqp, daqp_warm
+
+# Two matrices of 1.5 MB each, on a stack of 0.25 MB.
+slacks, variables, rows = 5, 250, 750
+rng = np.random.default_rng(0)
+a = np.hstack([-rng.uniform(0.1, 1.0, (rows, slacks)), rng.normal(size=(rows, variables))])
+data = (rng.normal(size=slacks + variables), a.T, np.full(rows, -np.inf), rng.uniform(0.1, 1.0, rows), np.zeros(slacks + rows))
+solve, other = daqp_warm(slacks, variables, rows), daqp(slacks, variables, rows)
+found = []
+threading.stack_size(1 << 18)
+thread = threading.Thread(target=lambda: found.append(np.array(solve(*data)[0])))
+thread.start()
+thread.join()
+np.testing.assert_allclose(found[0], np.array(other(*data)[0]), rtol=0, atol=1e-7)
+print("solved")
+"""
+
+
+def test_a_large_problem_needs_no_large_stack():
+    done = subprocess.run([sys.executable, "-c", LARGE], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "solved"), done.stderr
+
+
+def test_more_entries_than_daqp_can_count_are_an_error_of_the_compiler():
+    with pytest.raises(RuntimeError, match="the QP has too many variables or rows"):
+        daqp_warm(0, 50_000, 50_000)

@@ -98,6 +98,24 @@ def test_a_horizon_that_cannot_brake_is_found_and_a_longer_one_is_not():
     assert check_longer_horizon(replace(long, horizon=50), run(long, 60)) == []
 
 
+def test_the_closed_loop_costs_what_each_solve_takes_for_its_first_interval():
+    """l(x_k, u_k) with x_k as ``now``: here each solve wants to go half of what is left to 2 m."""
+
+    def cost(s):
+        ahead = s.now["x"] + 0.5 * (2 - s.now["x"])
+        return (s.x["x"] - ahead) ** 2 + 0.1 * s.x["v"] ** 2 + 0.01 * s.u["u"] ** 2
+
+    short = braking(2, cost=cost)
+    whole = run(short, 60)
+    (found,) = check_longer_horizon(short, whole)
+    far = run(replace(short, horizon=20), 60)
+    for name, episode in (("cost", whole), ("cost_longer", far)):
+        (x, v), u = episode.state[:-1].T, episode.input[:, 0]
+        beyond = episode.state[1:, 0] - 1.0
+        penalty = 1e4 * np.where(beyond > 1e-3, beyond, 0.0)
+        assert found.numbers[name] == pytest.approx(np.sum((0.5 * (2 - x)) ** 2 + 0.1 * v**2 + 0.01 * u**2 + penalty), rel=1e-6)
+
+
 def test_what_rises_and_falls_inside_an_interval_is_found_by_a_finer_model():
     controller = braking(25)
     whole = run(controller, 60)

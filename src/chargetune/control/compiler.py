@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 __all__ = ["cache_folder", "compile_library", "find_compiler"]
 
 # No -ffast-math: the checks for NaN and infinity must survive. -O3 makes an episode 15 % quicker than -O2. Loops are not
-# vectorised: GCC 12 with AVX-512 then wrote a local array of daqp_warm.c as if it were aligned, and the process died.
+# vectorised: GCC 12 with AVX-512 then wrote a local array as if it were aligned, and the process died.
 FLAGS = (
     *("-O3", "-march=native", "-fno-trapping-math", "-fno-signed-zeros", "-fno-math-errno", "-fno-tree-loop-vectorize"),
     *("-fPIC", "-shared", "-fno-semantic-interposition", "-Wl,-Bsymbolic"),

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from chargetune.control.estimators import Estimator, ExactState
 from chargetune.model.model import Model, Named
 from chargetune.model.parameters import ParameterSpace
+from chargetune.model.split import split
 
 __all__ = ["Controller", "Limit", "SoftLimit", "Stage"]
 
@@ -184,16 +185,33 @@ class Controller:
         )
 
     @cached_property
+    def estimation(self) -> ca.Function:
+        """The estimator's equations: (x_hat, memory, y, u, p) -> (x_hat and memory of ``correct``, memory of ``predict``)."""
+        model, names = self.model, self.estimator.signals(self.model)
+        sizes = (
+            len(model.states),
+            self.estimator.initial(model, np.array(self.start)).size,
+            len(names),
+            len(model.inputs),
+            model.nominal.size,
+        )
+        arguments = [ca.SX.sym(name, size) for name, size in zip(("x", "memory", "y", "u", "p"), sizes, strict=True)]
+        x, memory, y, u, p = arguments
+        estimate, corrected = self.estimator.correct(model, memory, {name: y[i] for i, name in enumerate(names)}, u, p)
+        ahead = self.estimator.predict(model, x, memory, u, p)
+        return ca.Function("estimation", arguments, [estimate, ca.SX(corrected), ca.SX(ahead)])
+
+    @cached_property
     def structure(self) -> str:
         """A hash of everything that is compiled in; numbers that are run-time values do not enter."""
         functions = [
-            self.model.f, self.model.h, self.parameters, self.stage_cost, self.terminal_cost,
+            self.estimation, self.model.f, self.model.h, self.parameters, self.stage_cost, self.terminal_cost,
             self.input_lower, self.input_upper, self.fallback, *(limit.rows for limit in self.limits),
         ]  # fmt: skip
         limits = [(limit.of, limit.at, limit.penalty, limit.scale) for limit in self.limits]
         names = [self.model.state_names, self.model.input_names, self.model.output_names, self.model.sampling_time_s]
         sizes = [self.theta.dimension, self.horizon, self.iterations_max, *names, self.model.parameter_blocks]
-        content = pickle.dumps(([f.serialize() for f in functions], limits, sizes, repr(self.estimator)))
+        content = pickle.dumps(([f.serialize() for f in functions], limits, sizes))
         return hashlib.sha256(content).hexdigest()
 
     def theta_vector(self, theta: ArrayLike | None) -> NDArray[np.float64]:
@@ -211,6 +229,7 @@ class _Symbols:
         self.x, self.u, self.p = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_)
         self.theta, self.now = ca.SX.sym("theta", theta.dimension), ca.SX.sym("now", nx)
         self.setpoint = ca.SX.sym("setpoint", nx + nu)
+        wanted_x, wanted_u = split(self.setpoint, (nx, nu))
         states, inputs = dict.fromkeys(model.state_names, 1), dict.fromkeys(model.input_names, 1)
         outputs = dict.fromkeys(model.output_names, 1)
         self.stage = Stage(
@@ -220,8 +239,8 @@ class _Symbols:
             p=Named(model.parameter_blocks, self.p),
             theta=Named(sizes, self.theta),
             now=Named(states, self.now),
-            x_d=Named(states, self.setpoint[:nx]),
-            u_d=Named(inputs, self.setpoint[nx:]),
+            x_d=Named(states, wanted_x),
+            u_d=Named(inputs, wanted_u),
         )
 
     def parameters(self, expression: Callable[[Stage], Mapping[str, Any]]) -> ca.Function:

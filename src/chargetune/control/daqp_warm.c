@@ -8,6 +8,7 @@
  * The Hessian is the identity, which makes this DAQP's own inner problem: nothing has to be factorised for it.
  * Rows are generated: the QP is solved with those that the guess says are active, and again with those that its solution
  * breaks, until it breaks none. Setting up a row costs as much as a pivot and most rows of a long horizon never matter.
+ * The work arrays are the caller's, on the heap: those of a long horizon are larger than a stack.
  * QP_SLACKS, QP_VARIABLES (slacks included), QP_ROWS and QP_TOLERANCE are set by the compiler's command line, QP_NAME is
  * the name of the function.
  * DAQP: Arnstrom, Bemporad, Axehill, IEEE Trans. Automatic Control 67 (2022), doi 10.1109/TAC.2022.3176430.
@@ -15,6 +16,7 @@
 #include <daqp/api.h>
 #include <daqp/utils.h>
 #include <float.h>
+#include <limits.h>
 #include <math.h>
 #include <string.h>
 
@@ -38,6 +40,34 @@ const long long *JOIN(QP_NAME, _sparsity_in)(long long i) {
   }
 }
 const long long *JOIN(QP_NAME, _sparsity_out)(long long i) { return i == 0 ? rows : all; }
+
+/* The numbers in all work arrays. DAQP counts the entries of a matrix with an int. */
+#define MATRIX ((long long)QP_ROWS * VARS)
+#define FACTOR ((long long)(VARS + 2) * (VARS + 3) / 2)
+#define DOUBLES (2 * MATRIX + FACTOR + 7LL * CONS + QP_ROWS + 7LL * (VARS + 2) + 2LL * VARS)
+#define INTS (2LL * CONS + 2LL * QP_ROWS + VARS + 2)
+_Static_assert(MATRIX < INT_MAX && FACTOR < INT_MAX, "the QP has too many variables or rows");
+
+int JOIN(QP_NAME, _work)(long long *sz_arg, long long *sz_res, long long *sz_iw, long long *sz_w) {
+  if (sz_arg) *sz_arg = 5;
+  if (sz_res) *sz_res = 2;
+  if (sz_iw) *sz_iw = INTS;
+  if (sz_w) *sz_w = DOUBLES;
+  return 0;
+}
+
+static double *doubles(double **w, long long n) {
+  double *taken = *w;
+  *w += n;
+  return taken;
+}
+
+/* An int in each of the caller's long integers' places. */
+static int *ints(long long **iw, long long n) {
+  int *taken = (int *)*iw;
+  *iw += n;
+  return taken;
+}
 
 /* Below this a row counts as kept; far above rounding, far below the tolerance of the optimality check. */
 #define ROW_TOLERANCE 1e-9
@@ -79,16 +109,18 @@ static int finite_all(const double *a, int n) {
 }
 
 int QP_NAME(const double **arg, double **res, long long *iw, double *w, int mem) {
-  double a[QP_ROWS * VARS + 1], lower[CONS], upper[CONS], m[QP_ROWS * VARS + 1], v[VARS], scaling[CONS], dupper[CONS], dlower[CONS];
-  double lam[VARS + 2], lam_star[VARS + 2], l[(VARS + 2) * (VARS + 3) / 2], d[VARS + 2], xldl[VARS + 2], zldl[VARS + 2];
-  double x[VARS + 1], xold[VARS + 1], primal[VARS], dual[CONS], guess[CONS], value[QP_ROWS + 1];
-  int sense[CONS], start[CONS], origin[QP_ROWS + 1], used[QP_ROWS + 1], working[VARS + 2], kept = 0, taken = 0, added, good, i;
+  double *a = doubles(&w, MATRIX), *m = doubles(&w, MATRIX), *l = doubles(&w, FACTOR);
+  double *lower = doubles(&w, CONS), *upper = doubles(&w, CONS), *scaling = doubles(&w, CONS), *dupper = doubles(&w, CONS);
+  double *dlower = doubles(&w, CONS), *dual = doubles(&w, CONS), *guess = doubles(&w, CONS), *value = doubles(&w, QP_ROWS);
+  double *lam = doubles(&w, VARS + 2), *lam_star = doubles(&w, VARS + 2), *d = doubles(&w, VARS + 2), *xldl = doubles(&w, VARS + 2);
+  double *zldl = doubles(&w, VARS + 2), *x = doubles(&w, VARS + 2), *xold = doubles(&w, VARS + 2);
+  double *v = doubles(&w, VARS), *primal = doubles(&w, VARS);
+  int *sense = ints(&iw, CONS), *start = ints(&iw, CONS), *origin = ints(&iw, QP_ROWS), *used = ints(&iw, QP_ROWS);
+  int *working = ints(&iw, VARS + 2), kept = 0, taken = 0, added, good, i;
   DAQPSettings settings;
   DAQPProblem qp;
   DAQPWorkspace work;
   DAQPResult result;
-  (void)iw;
-  (void)w;
   (void)mem;
 
   memset(&work, 0, sizeof work);

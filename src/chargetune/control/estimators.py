@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.model.model import Model, Named
+from chargetune.model.split import split
 
 __all__ = ["Estimator", "ExactState", "ExtendedKalman", "Propagated", "finite"]
 
@@ -139,7 +140,8 @@ class ExtendedKalman:
 
     def correct(self, model: Model, memory: Any, y: Mapping[str, Any], u: Any, p: Any) -> tuple[Any, Any]:
         nx = len(model.states)
-        x, covariance = memory[:nx], ca.reshape(memory[nx:], nx, nx)
+        x, packed = split(memory, (nx, nx * nx))
+        covariance = ca.reshape(packed, nx, nx)
         at = ca.SX.sym("at", nx)
         outputs = model.h(at, u, p)
         for name, sd in zip(self.measured, self.measurement_sd, strict=True):
@@ -156,7 +158,8 @@ class ExtendedKalman:
 
     def predict(self, model: Model, x_hat: Any, memory: Any, u: Any, p: Any) -> Any:
         nx = len(model.states)
-        covariance = ca.reshape(memory[nx:], nx, nx)
+        _, packed = split(memory, (nx, nx * nx))
+        covariance = ca.reshape(packed, nx, nx)
         at = ca.SX.sym("at", nx)
         (transition,) = ca.substitute([ca.jacobian(model.f(at, u, p), at)], [at], [x_hat])
         ahead = ca.mtimes([transition, covariance, transition.T]) + ca.DM(np.diag(np.square(self.process_sd)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -17,6 +16,8 @@ from chargetune.control.controller import Controller
 from chargetune.control.ocp import Problem, control_problem
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.control.sqp import SolveStatus, cold, solver
+from chargetune.model.built import Built
+from chargetune.model.split import split
 
 __all__ = ["Act", "Info", "Memory", "act", "begin", "cached", "compiled_act", "control_step", "problem_of"]
 
@@ -41,19 +42,12 @@ class Info:
 
 
 T = TypeVar("T")
-_BUILT: OrderedDict[str, Any] = OrderedDict()
-BUILT_MAX = 32
+_BUILT = Built(32)
 
 
 def cached(key: str, build: Callable[[], T]) -> T:
-    """What ``build`` makes, kept under ``key``; the oldest of many goes first."""
-    if key not in _BUILT:
-        _BUILT[key] = build()
-        while len(_BUILT) > BUILT_MAX:
-            _BUILT.popitem(last=False)
-    _BUILT.move_to_end(key)
-    built: T = _BUILT[key]
-    return built
+    """What ``build`` makes, kept under ``key``; see `Built`."""
+    return _BUILT.get(key, build)
 
 
 def problem_of(controller: Controller) -> Problem:
@@ -68,7 +62,7 @@ def control_step(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     last, warm, q = ca.MX.sym("u", nu), ca.MX.sym("warm", solve.size1_in(1)), ca.MX.sym("q", solve.size1_in(2))
     estimate, corrected = problem.correct(memory, y, last, q)
     inputs, following, status, kkt, count = solve(estimate, warm, q)
-    u = inputs[:nu]
+    u, *_ = split(inputs, [nu] * problem.controller.horizon)
     ahead = problem.predict(estimate, corrected, u, q)
     return ca.Function("control_step", [memory, y, last, warm, q], [u, ahead, following, status, kkt, count, estimate])
 
@@ -148,9 +142,9 @@ def _machine_code(problem: Problem) -> ca.Function:
     """The control step with its arguments and its results in one vector each."""
     step = control_step(problem, daqp_warm)
     arguments = step.mx_in()
-    sizes = np.cumsum([0, *(a.shape[0] for a in arguments)]).tolist()
-    given = ca.MX.sym("given", sizes[-1])
-    u, ahead, warm, status, kkt, count, estimate = step(*ca.vertsplit(given, sizes))
+    sizes = [a.shape[0] for a in arguments]
+    given = ca.MX.sym("given", sum(sizes))
+    u, ahead, warm, status, kkt, count, estimate = step(*split(given, sizes))
     control = ca.Function("control", [given], [ca.vertcat(u, ahead, warm, status, kkt, count, estimate)])
     generator = ca.CodeGenerator("control", {"with_header": False})
     generator.add(control)

@@ -15,6 +15,7 @@ import numpy as np
 
 from chargetune.control.controller import Controller
 from chargetune.control.estimators import finite
+from chargetune.model.split import split
 
 __all__ = ["Problem", "control_problem", "row_weight"]
 
@@ -92,9 +93,7 @@ def control_problem(controller: Controller) -> Problem:
     x, u, now = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("now", nx)
     theta, setpoint = ca.SX.sym("theta", controller.theta.dimension), ca.SX.sym("setpoint", nx + nu)
     nominal = ca.SX.sym("p", model.nominal.size)
-    memory = ca.SX.sym("memory", controller.estimator.initial(model, np.zeros(nx)).size)
-    signals = controller.estimator.signals(model)
-    y = ca.SX.sym("y", len(signals))
+    memory, y = (ca.SX.sym(name, controller.estimation.size1_in(i)) for i, name in ((1, "memory"), (2, "y")))
 
     p = controller.parameters(theta, nominal)
     after = model.f(x, u, p)
@@ -103,7 +102,7 @@ def control_problem(controller: Controller) -> Problem:
     def rows(places: tuple[str, ...], state: Any, control: Any) -> Any:
         return ca.vertcat(*(limit.rows(state, control, theta, p, now) / limit.scale for limit in limits if limit.at in places))
 
-    x_hat, corrected = controller.estimator.correct(model, memory, {n: y[i] for i, n in enumerate(signals)}, u, p)
+    x_hat, corrected, predicted = controller.estimation(x, memory, y, u, p)
     expressions = [
         after,
         controller.stage_cost(x, u, theta, p, setpoint, now),
@@ -114,8 +113,8 @@ def control_problem(controller: Controller) -> Problem:
         controller.input_upper(theta, p, now),
         controller.fallback(theta, p, now),
         x_hat,
-        ca.SX(corrected),
-        ca.SX(controller.estimator.predict(model, x, memory, u, p)),
+        corrected,
+        predicted,
     ]
     # Everything that depends on theta and p alone is computed once an episode instead of at every stage. What two of these expressions
     # share has to be one beforehand: two symbols for one number are not recognised any more.
@@ -170,9 +169,10 @@ class _Linearisation:
         xu = ca.vertcat(x, u)
         curvature, slope = ca.hessian(cost, xu)
         nx = x.shape[0]
+        slope_x, slope_u = split(slope, (nx, u.shape[0]))
         parts = [
             ca.jacobian(after, x), ca.jacobian(after, u), ca.jacobian(rows, x), ca.jacobian(rows, u),
-            slope[:nx], slope[nx:], curvature[:nx, :nx], curvature[nx:, :nx], curvature[nx:, nx:],
+            slope_x, slope_u, curvature[:nx, :nx], curvature[nx:, :nx], curvature[nx:, nx:],
         ]  # fmt: skip
         parts = [ca.sparsify(part) for part in parts]
         return cls(ca.vertcat(*(ca.vertcat(*part.nonzeros()) for part in parts)), tuple(part.sparsity() for part in parts))
@@ -183,11 +183,8 @@ class _Linearisation:
 
     def unpack(self, vector: Any) -> list[Any]:
         """[f_x, f_u, c_x, c_u, l_x, l_u, l_xx, l_ux, l_uu] from the packed vector."""
-        out, start = [], 0
-        for pattern in self.patterns:
-            out.append(ca.SX(pattern, vector[start : start + pattern.nnz()]))
-            start += pattern.nnz()
-        return out
+        pieces = split(vector, (pattern.nnz() for pattern in self.patterns))
+        return [ca.SX(pattern, piece) for pattern, piece in zip(self.patterns, pieces, strict=True)]
 
 
 def _sweep(stage: ca.Function, final: ca.Function, horizon: int, nx: int, nu: int, nq: int) -> ca.Function:
@@ -229,8 +226,8 @@ def _blocks(vector: Any, size: int) -> list[Any]:
 
 
 def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, horizon: int) -> tuple[list[list[Any]], list[Any]]:
-    n = stage.length
-    return [stage.unpack(vector[i * n : (i + 1) * n]) for i in range(horizon)], final.unpack(vector[horizon * n :])
+    *stages, last = split(vector, (*[stage.length] * horizon, final.length))
+    return [stage.unpack(one) for one in stages], final.unpack(last)
 
 
 def _second(x: Any, u: Any, now: Any, q: Any, weight: Any, after: Any, rows: Any) -> ca.Function:
@@ -263,15 +260,17 @@ def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, 
     vector, multipliers = ca.MX.sym("D", whole.shape[0]), ca.MX.sym("lambda", horizon * width + final_x.shape[0])
     lower, upper = ca.MX.sym("lower", horizon * nu), ca.MX.sym("upper", horizon * nu)
     scaling = scaled(vector, lower, upper)
+    controls = split(inputs, [nu] * horizon)
+    *derivatives, last_derivatives = split(vector, (*[stage.length] * horizon, final.length))
+    *prices, last_price = split(multipliers, (*[width] * horizon, final_x.shape[0]))
     states = [now]
-    for i in range(horizon - 1):
-        states.append(follow(states[-1], inputs[i * nu : (i + 1) * nu], q))
-    costate = end(vector[horizon * stage.length :], multipliers[horizon * width :], scaling)
+    for u in controls[:-1]:
+        states.append(follow(states[-1], u, q))
+    costate = end(last_derivatives, last_price, scaling)
     out: list[Any] = []
     for i in reversed(range(horizon)):
-        u, lam = inputs[i * nu : (i + 1) * nu], multipliers[i * width : (i + 1) * width]
-        out.insert(0, second(states[i], u, now, q, row_weight(i, horizon), costate, lam))
-        costate = back(vector[i * stage.length : (i + 1) * stage.length], costate, lam, scaling)
+        out.insert(0, second(states[i], controls[i], now, q, row_weight(i, horizon), costate, prices[i]))
+        costate = back(derivatives[i], costate, prices[i], scaling)
     return ca.Function("curvature", [now, inputs, vector, multipliers, lower, upper, q], [ca.vertcat(*out)])
 
 
@@ -365,13 +364,13 @@ def _residual(controller: Controller, stage: _Linearisation, final: _Linearisati
     stages, last = _derivatives(vector, stage, final, horizon)
     span, width = _span(lower, upper), stages[0][2].shape[0]
 
-    costate = gamma * last[4] + ca.mtimes(last[2].T, multipliers[horizon * width :])
+    *prices, last_price = split(multipliers, (*[width] * horizon, last[2].shape[0]))
+    costate = gamma * last[4] + ca.mtimes(last[2].T, last_price)
     slopes: list[Any] = []
     for i in reversed(range(horizon)):
         f_x, f_u, c_x, c_u, l_x, l_u, *_ = stages[i]
-        own = multipliers[i * width : (i + 1) * width]
-        slopes.insert(0, gamma * l_u + ca.mtimes(c_u.T, own) + ca.mtimes(f_u.T, costate))
-        costate = gamma * l_x + ca.mtimes(c_x.T, own) + ca.mtimes(f_x.T, costate)
+        slopes.insert(0, gamma * l_u + ca.mtimes(c_u.T, prices[i]) + ca.mtimes(f_u.T, costate))
+        costate = gamma * l_x + ca.mtimes(c_x.T, prices[i]) + ca.mtimes(f_x.T, costate)
     slope = ca.densify(ca.vertcat(*slopes)) * span
     residuals = [ca.fabs(_least(_greatest(-slope, (lower - inputs) / span), (upper - inputs) / span))]
     for j, (limit, s) in enumerate(zip(controller.limits, _violations(controller, groups, rows), strict=True)):

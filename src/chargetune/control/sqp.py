@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from chargetune.control.estimators import finite
 from chargetune.control.ocp import Problem
 from chargetune.control.qp import QPSolver, daqp
+from chargetune.model.split import split
 
 __all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
 
@@ -70,9 +71,10 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     # Bounds may depend on the estimate; they must stay numbers when it is not one.
     known = ca.if_else(finite(ca.sum1(ca.fabs(now))), now, ca.DM.zeros(nx))
     lower, upper = problem.bounds(known, q)
-    start = ca.fmin(ca.fmax(warm[:size], lower), upper)
+    before, dual_before = split(warm, (size, duals))
+    start = ca.fmin(ca.fmax(before, lower), upper)
     cost, rows, derivatives = problem.sweep(now, start, q)
-    found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), warm[size:], lower, upper, q)
+    found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), dual_before, lower, upper, q)
     usable = finite(ca.sum1(ca.fabs(found)))
     declared = ca.repmat(problem.fallback(known, q), problem.controller.horizon, 1)
     bounded = ca.fmin(ca.fmax(ca.if_else(usable, found, declared), lower), upper)
@@ -121,14 +123,19 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     of = problem.curvature.mx_in()
     straight = ca.Function("straight", of, [ca.DM.zeros(problem.size)])
     curvature = ca.Function.if_else("curvature", problem.curvature, straight)
-    bent = curvature(bend, now, inputs, derivatives, dual[len(limits) + problem.size :], lower, upper, q)
+    # Multipliers: of the slacks' bounds, of the inputs' bounds, of the rows.
+    sizes = (len(limits) + problem.size, rows)
+    _, prices = split(dual, sizes)
+    bent = curvature(bend, now, inputs, derivatives, prices, lower, upper, q)
     *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper, bent)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
     allowed = merit + KKT_TOLERANCE**2 / gamma + rounding
-    point = list(_line_search(problem)(now, inputs, span * values[: problem.size], 1.0, allowed, q))
-    kkt = problem.residual(*point[:3], new_dual[len(limits) + problem.size :], gamma, lower, upper)
+    direction, _ = split(values, (problem.size, rows))
+    point = list(_line_search(problem)(now, inputs, span * direction, 1.0, allowed, q))
+    _, prices = split(new_dual, sizes)
+    kkt = problem.residual(*point[:3], prices, gamma, lower, upper)
     return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual, kkt])
 
 

@@ -26,6 +26,7 @@ from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.lattice import Lattice
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.model.evaluated import evaluated
+from chargetune.model.split import split
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
@@ -172,7 +173,8 @@ def compiled_episode(
     """
     check_run(plant, steps, 0, ())
     indices = tuple(signal_indices(controller, plant))
-    own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.sensors.delay_steps}"
+    # A lattice finds the outputs by name.
+    own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.model.output_names} {plant.sensors.delay_steps}"
     use = find_compiler() is not None if compiled is None else compiled
     key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices} {lattice}"
 
@@ -182,7 +184,7 @@ def compiled_episode(
         except (RuntimeError, OSError) as error:
             if compiled or not use:
                 raise
-            warnings.warn(f"episodes run on the virtual machine, about 8 times slower: {error}", RuntimeWarning, stacklevel=4)
+            warnings.warn(f"episodes run on the virtual machine, about 8 times slower: {error}", RuntimeWarning, stacklevel=5)
             return *_built(controller, plant, indices, steps, lattice), False
 
     function, prepare, used = cached(key, build)
@@ -258,8 +260,11 @@ def _built(
     def errs(y: ca.MX, u: ca.MX, table: ca.MX) -> ca.MX:
         return added(y, u, table) if added else ca.MX.zeros(ny)
 
-    received = sent[:ny]
-    u, ahead, following, status, kkt, count, estimate = control(memory, received[list(indices)] if indices else ca.MX(0, 1), last, warm, q)
+    # The oldest sample is the one that arrives.
+    arriving, underway = split(sent, (ny, ny * delay))
+    signals = split(arriving, [1] * ny)
+    received = ca.vertcat(ca.MX(0, 1), *(signals[i] for i in indices))
+    u, ahead, following, status, kkt, count, estimate = control(memory, received, last, warm, q)
     after = transition(x, u, plant_q) + noise
     before_y, after_y = output(x, u, plant_q), output(after, u, plant_q)
     start = measure(before_y, error_start + errs(before_y, u, table), resolution)
@@ -268,15 +273,15 @@ def _built(
     unknown = ca.vertcat(error_start, error_end, noise)
     unknowns = ca.MX.sym("unknown", unknown.shape[0])
     step = ca.Function("plain_step", [*carried, *fixed, error_start, error_end, noise], [
-        after, ahead, u, following, ca.vertcat(sent[ny:], end),
+        after, ahead, u, following, ca.vertcat(underway, end),
         ca.vertcat(after, u, before_y, after_y, start, end, estimate, status, kkt, count),
     ])  # fmt: skip
-    parts = ca.vertsplit(unknowns, [0, ny, 2 * ny, 2 * ny + nx])
+    parts = split(unknowns, (ny, ny, nx))
     step = ca.Function("step", [*carried, *fixed, unknowns], list(step(*carried, *fixed, *parts)))
 
     first = [x, memory, last, warm, q, plant_q, resolution, table, ca.MX.sym("e_rest", ny)]
     given = ca.MX.sym("given", sum(v.shape[0] for v in first))
-    x0, memory0, last0, warm0, *fixed0, error = ca.vertsplit(given, np.cumsum([0, *(v.shape[0] for v in first)]).tolist())
+    x0, memory0, last0, warm0, *fixed0, error = split(given, [v.shape[0] for v in first])
     nothing = ca.MX.zeros(len(plant.inputs))
     rest_y = output(x0, nothing, fixed0[1])
     rest = measure(rest_y, error + errs(rest_y, nothing, fixed0[3]), fixed0[2])

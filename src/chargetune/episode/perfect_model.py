@@ -209,10 +209,13 @@ def _hump(controller: Controller, j: int, finer: Model | None, run: Episode, the
 
 
 def _costs(controller: Controller, run: Episode, theta: ArrayLike | None) -> NDArray[np.float64]:
-    """Stage costs along a closed loop and the penalty of what it violates, shape (K,)."""
+    """l(x_k, u_k) of every interval of a closed loop, with x_k as ``now``, and the penalty of what it violates there, shape (K,).
+
+    That is what the solve at k takes for its first interval.
+    """
     if run.state is None:
         raise ValueError("the episode has no state")
-    values, count, x = controller.theta_vector(theta), len(run), run.state[1:]
+    values, count, x = controller.theta_vector(theta), len(run), run.state[:-1]
     p = controller.parameters(values, controller.model.nominal)
     fixed: list[Any] = [ca.repmat(ca.DM(v), 1, count) for v in (values, p, np.array(controller.setpoint))]
     cost = np.array(controller.stage_cost.map(count)(x.T, run.input.T, *fixed, x.T)).ravel()

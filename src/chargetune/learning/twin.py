@@ -13,7 +13,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import casadi as ca
@@ -27,9 +27,11 @@ from chargetune.episode.episode import Episode
 from chargetune.learning.misfit import Misfit
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.sections import sections
+from chargetune.model.built import built_once
 from chargetune.model.evaluated import evaluated
 from chargetune.model.model import Model
 from chargetune.model.parametric import parametric
+from chargetune.model.split import split
 
 if TYPE_CHECKING:
     from chargetune.learning.discrepancy import Discrepancy, Foretold
@@ -275,7 +277,9 @@ class _Key:
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
         model = twin.model
-        self._content = (model.f.__hash__(), model.h.__hash__(), twin.unknowns, tuple(twin.noise_sd))
+        # The functions live as long as this key, so no others have their hashes meanwhile.
+        names = (model.state_names, model.output_names, tuple(model.parameter_blocks.items()))
+        self._content = (model.f.__hash__(), model.h.__hash__(), *names, twin.unknowns, tuple(twin.noise_sd))
 
     def __hash__(self) -> int:
         return hash(self._content)
@@ -299,7 +303,7 @@ def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any, Any]:
     model = twin.model
     m = ca.SX.sym("m", sum(twin.sizes))
     nominal, begin = ca.SX.sym("nominal", model.nominal.size), ca.SX.sym("begin", len(model.states))
-    pieces = ca.vertsplit(m, np.cumsum([0, *twin.sizes]).tolist())
+    pieces = split(m, twin.sizes)
     parts = {_slot(one): piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
     kinds = {one.name: one.kind for one in twin.unknowns if one.kind in ("factor", "offset")}
     blocks, first = [], 0
@@ -312,7 +316,7 @@ def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any, Any]:
     return m, nominal, begin, ca.vertcat(*blocks), ca.vertcat(*starts), ca.vertcat(*bias)
 
 
-@lru_cache(maxsize=16)
+@built_once(16)
 def _mapping(key: _Key) -> tuple[ca.Function, ca.Function]:
     """(m, nominal, begin) -> p, and -> x0."""
     m, nominal, begin, p, x0, _ = _symbols(key.twin)
@@ -335,13 +339,13 @@ def _evaluated(key: _Key, which: int, inputs: NDArray[np.float64], m: NDArray[np
     return out
 
 
-@lru_cache(maxsize=128)
+@built_once(128)
 def _mapped(key: _Key, length: int, which: int, count: int) -> ca.Function:
     one = _simulated(key, length)[which]
     return one if count == 1 else one.map(count)
 
 
-@lru_cache(maxsize=32)
+@built_once(32)
 def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     """((m, nominal, begin, inputs) -> outputs, their Jacobian with respect to m) for ``count`` intervals.
 

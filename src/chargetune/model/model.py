@@ -11,6 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.model.split import split
+
 __all__ = ["Model", "Named", "Signal"]
 
 
@@ -31,24 +33,20 @@ class Named(Mapping[str, Any]):
 
     def __init__(self, blocks: Mapping[str, int], vector: Any) -> None:
         self.vector = vector
-        self._slices: dict[str, slice] = {}
-        start = 0
-        for name, size in blocks.items():
-            self._slices[name] = slice(start, start + size)
-            start += size
-        if vector.shape[0] != start:
-            raise ValueError(f"vector has {vector.shape[0]} rows, expected {start} for {', '.join(blocks)}")
+        if vector.shape[0] != sum(blocks.values()):
+            raise ValueError(f"vector has {vector.shape[0]} rows, expected {sum(blocks.values())} for {', '.join(blocks)}")
+        self._blocks = dict(zip(blocks, split(vector, blocks.values()), strict=True))
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self._slices:
-            raise KeyError(f"unknown name {name!r}, allowed are {', '.join(self._slices) or '(none)'}")
-        return self.vector[self._slices[name]]
+        if name not in self._blocks:
+            raise KeyError(f"unknown name {name!r}, allowed are {', '.join(self._blocks) or '(none)'}")
+        return self._blocks[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._slices)
+        return iter(self._blocks)
 
     def __len__(self) -> int:
-        return len(self._slices)
+        return len(self._blocks)
 
 
 Equations = Callable[[Named, Named, Named], tuple[Mapping[str, Any], Mapping[str, Any]]]
