@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging import ChargingProblem, NotMeasuredError
 from chargetune.battery.charging_check import stand_in
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.control.controller import Controller
@@ -145,7 +145,7 @@ class ChargingTwin:
         """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
         try:
             return self._exact.score(episode, metrics=False)
-        except ValueError:
+        except NotMeasuredError:
             return None
 
     def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
@@ -97,7 +98,10 @@ class _Linear:
         matrix = np.hstack([jacobian, -np.ones((rows.size, 1))])
         bounds = [*zip(*lines.room(radius), strict=True), (0.0, None)]
         found = linprog(np.append(lines.gradient, price), A_ub=matrix, b_ub=-rows, bounds=bounds, method="highs")
-        return (np.zeros(d), 0.0) if found.x is None else (found.x[:d], float(found.x[d]))
+        if found.x is None:
+            warnings.warn(f"a linear program of {rows.size} rows failed, no step ({found.message})", RuntimeWarning, stacklevel=2)
+            return np.zeros(d), float(np.max(lines.rows + bent, initial=0.0))
+        return found.x[:d], float(found.x[d])
 
     def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
         return -float(lines.gradient @ step)
