@@ -34,8 +34,8 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
-# Plants that are remembered: those of two ensembles.
-PLANTS_KEPT = 128
+# Plants that are remembered: those that thetas are chosen by, and those that the chosen one is judged by.
+PLANTS_KEPT = 256
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 

@@ -50,8 +50,9 @@ SEARCHES = 3
 NEARINGS = 2
 # Of the way to what is aimed at where that is not safe, the shares that are tried; the first that is safe is taken.
 PARTS = (0.8, 0.5, 0.25)
-# Added to the seed of the plants that candidates are chosen by: that of those which the chosen one is judged by.
-FRESH = 104_729
+# Added to the seed of the plants that candidates are chosen by: that of those which the chosen one is judged by, and how many these are.
+# The standard error of a probability of 0.95 is 0.019; of 32 fresh plants 4 refused a theta that 97 of 100 allow.
+FRESH, JUDGES = 104_729, 128
 # Parameters whose corners are all tried for a start: eight ensembles.
 CORNERS_OF = 3
 
@@ -95,7 +96,7 @@ class SafeAsk(Ask):
 
         Of many candidates that are judged by the same plants those are found that just these allow: their share says too much.
         """
-        return self.belief.predict(theta, self.draws, self.seed + FRESH).probability() >= self.safety.probability
+        return self.belief.predict(theta, JUDGES, self.seed + FRESH).probability() >= self.safety.probability
 
     def _back_from(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of the way from the best trial that kept the limits to theta the longest of `PARTS` that holds, else what was tried."""
