@@ -1,4 +1,4 @@
-"""Interrupted is uninterrupted: what another process with another tuner proposes from the store is what this one would have, bit for bit."""
+"""Interrupted is uninterrupted: what another process proposes from the store is what this one would have, bit for bit."""
 
 import subprocess
 import sys
@@ -22,9 +22,9 @@ PROBLEM = ChargingProblem(
     default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0, scale=True),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
     soc_start=0.7, steps=24, verdict_samples=3,
 )  # fmt: skip
-# By tuner the trials of the whole study, and how many there are when it is interrupted: one that neither asked nor told without a fit.
+# By tuner the trials of the whole study, and how many there are when it is interrupted: enough that it has learnt.
 TUNERS = {
-    "twin": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2), 5, 3),
+    "twin": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, pool=4, steps=2, iterations=3), 4, 2),
     "safe": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, safety=Safety()), 4, 2),
     "composite": (lambda: Composite(ChargingWindows(PROBLEM), seed=2, n_initial=2), 6, 4),
     "envelope": (lambda: Envelope(ChargingTwin(PROBLEM)), 5, 2),

@@ -17,6 +17,7 @@ from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner, safe_ask
 from chargetune.learning.ask import Ask
 from chargetune.learning.belief import believe, windows_of
+from chargetune.learning.discrepancy import SCALES
 from chargetune.learning.nearest import nearest
 from chargetune.learning.safe_ask import SafeAsk
 from chargetune.plants.sensors import Sensors
@@ -272,19 +273,62 @@ def test_less_is_kept_back_the_more_trials_were_foretold_and_never_less_than_the
     assert kept_back[-1] > norm.ppf(0.9 ** (1 / 3))
 
 
-def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
-    problem = charge(noise=0.0)
+def unforeseen(problem):
+    """Three trials whose voltages no circuit has."""
     trials = []
     for number, theta in enumerate((np.full(9, 3.0), np.full(9, 2.5), np.full(9, 2.0))):
         score, episode, _ = problem(theta, number)
         wrong = episode.output_end.copy()
         wrong[:, 0] += 0.3 * np.sin(np.arange(len(episode)) / 25 + 2 * number)
         trials.append(told(number, theta, score, replace(episode, output_end=wrong, output_start=wrong)))
-    tuner = TwinTuner(ChargingTwin(problem))
+    return trials
+
+
+def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
+    problem = charge(noise=0.0)
+    trials, tuner = unforeseen(problem), TwinTuner(ChargingTwin(problem))
     assert believe(tuner.loop, trials).mistake > 4
     with pytest.warns(RuntimeWarning, match="the black box's"):
         proposed = tuner.ask(problem.space, trials)
     assert proposed.shape == (1, 9)
+
+
+def test_a_twin_that_foresaw_nothing_is_not_asked_what_is_safe():
+    problem = charge(noise=0.0)
+    trials, tuner = unforeseen(problem), TwinTuner(ChargingTwin(problem), safety=Safety())
+    assert [t.score.feasible for t in trials] == [True] * 3
+    best = max(trials, key=lambda t: t.score.objective)
+    with pytest.warns(RuntimeWarning, match="did not foresee the last trial .* is proposed again"):
+        np.testing.assert_array_equal(tuner.ask(problem.space, trials, 2), [best.theta] * 2)
+    broken = [told(t.number, t.theta, replace(t.score, excess={"voltage_max_V": 1.0}), t.episode()) for t in trials]
+    with pytest.raises(NoSafeThetaError, match="no trial kept every limit; nothing was proposed"):
+        tuner.ask(problem.space, broken)
+
+
+def test_errors_beyond_every_scale_are_said():
+    ask, theta = after_one_charge()
+    ask = replace(ask, belief=replace(ask.belief, discrepancy=ask.belief.discrepancy.scaled(SCALES[-1])))
+    with pytest.warns(RuntimeWarning, match="more than it can allow for"):
+        np.testing.assert_array_equal(ask.thetas(), [theta])
+
+
+def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch):
+    """What comes out of the search is put where the limit breaks: a part of the way there is proposed, and it holds on other plants."""
+    ask, theta = after_one_charge()
+    monkeypatch.setattr(SafeAsk, "_nearer", lambda *_: np.full(9, 1.2))
+    assert not ask._holds(np.full(9, 1.2))
+    (proposed,) = ask.thetas()
+    assert ask.belief.predict(proposed, 100, 12345).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
+    assert 1.2 < proposed[0] < theta[0]
+    np.testing.assert_allclose(proposed, proposed[0])
+
+
+def test_trials_of_another_cell_are_refused():
+    problem = charge(noise=0.0)
+    score, episode, _ = problem(problem.space.upper, 0)
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    with pytest.raises(ValueError, match="trials of earlier studies"):
+        tuner.ask(problem.space, [told(-1, problem.space.upper, score, episode)])
 
 
 def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
