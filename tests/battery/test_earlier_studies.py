@@ -61,3 +61,12 @@ def test_bad_tables_are_refused_by_name(tmp_path, table, message):
     (tmp_path / "s.toml").write_text(QUICK + table)
     with pytest.raises(ValueError, match=message):
         load_config(tmp_path / "s.toml")
+
+
+def test_a_safe_study_begins_with_no_other_cells_trials(tmp_path):
+    text = QUICK.replace("NAME", "safe").replace("sobol", "twin") + "[safety]\n" + KEY
+    (tmp_path / "s.toml").write_text(text)
+    with Store(tmp_path / "s.sqlite") as store, pytest.raises(ValueError, match=r"\[safety\] is given with \[\[study.earlier\]\]"):
+        open_study(store, load_config(tmp_path / "s.toml"), tmp_path)
+    with Store(tmp_path / "s.sqlite") as store:
+        assert store.studies() == []

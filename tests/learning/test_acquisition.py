@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from botorch.acquisition.acquisition import AcquisitionFunction
 from botorch.acquisition.analytic import (
     ExpectedImprovement as BotorchEI,
 )
@@ -120,3 +121,26 @@ def test_a_limit_out_of_reach_is_left_out(values):
 def test_tolerance_zero_works():
     (limit,) = limits_of([Trial(score(v, tolerance=0.0)) for v in (-0.2, 0.1, 0.3, 0.0)])
     np.testing.assert_array_equal(limit.values <= limit.bound, [True, False, False, True])
+
+
+class Rough(AcquisitionFunction):
+    """Finite everywhere, and where it is to be improved without a gradient, or of a mistake in the program."""
+
+    def __init__(self, failure):
+        super().__init__(GaussianProcess().fit(X, Y[:, 0]))
+        self.failure = failure
+
+    def forward(self, x):
+        if x.requires_grad and self.failure == "mistake":
+            raise RuntimeError("shapes do not fit")
+        return x[:, 0, 0] + (0.0 * x).sum(-1).sum(-1).sqrt()
+
+
+def test_a_search_that_fails_is_warned_of_and_a_mistake_is_none_of_its_failures():
+    with reproducible(0):
+        points = candidates(2, 0, None)
+        with pytest.warns(RuntimeWarning, match="the best of 128 points stands"):
+            found = maximise(Rough("gradient"), points, X.numpy())
+        assert found[0] == points[:, 0].max()
+        with pytest.raises(RuntimeError, match="shapes do not fit"):
+            maximise(Rough("mistake"), points, X.numpy())

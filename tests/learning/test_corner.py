@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from chargetune.learning.corner import Point, corner
+from chargetune.learning.corner import Lines, Point, _Linear, corner
 
 
 class Counted:
@@ -128,3 +128,12 @@ def test_what_is_broken_by_no_more_than_counts_as_kept_is_no_reason_to_go_on():
     assert limits(most)[0] <= 1e-5
     assert 0.01 < limits(enough)[0] <= 0.2
     assert len(short.points) < len(whole.points)
+
+
+def test_a_linear_program_without_a_solution_is_warned_of_and_no_step():
+    """From a point outside the cube no short step leads into it."""
+    lines = Lines(np.array([1.5]), np.array([0.3, -0.1]), np.ones(1), np.ones((2, 1)))
+    with pytest.warns(RuntimeWarning, match="a linear program of 2 rows failed"):
+        step, left = _Linear().step(lines, 0.15, 1.0)
+    np.testing.assert_array_equal(step, [0.0])
+    assert left == 0.3

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import norm
 from two_pairs import AnotherCell, TwoPairs
 
@@ -13,7 +14,8 @@ from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.thermal import Thermal
 from chargetune.battery.twin import ChargingTwin
 from chargetune.learning.belief import believe
-from chargetune.learning.discrepancy import Discrepancy, _Part, scale_of
+from chargetune.learning.discrepancy import LENGTH, SCALES, Discrepancy, _fit, _Part, scale_of
+from chargetune.learning.surrogate import SurrogateWarning
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -203,3 +205,33 @@ def test_features_are_one_to_three():
     belief, episodes = beliefs(charge(steps=60), (4.0,))
     with pytest.raises(ValueError, match="allowed are 1 to 3"):
         Discrepancy(belief.posterior, tuple(episodes), {})
+
+
+@pytest.mark.usefixtures("virtual_machine")
+@pytest.mark.parametrize("scale", [0.1, 1.0, 6.3])
+def test_the_scale_is_inferred_of_what_it_is_applied_to(scale):
+    """The variance that a scale is judged by is that of drawn errors with this scale: Monte Carlo, and through the table."""
+    problem = charge(pairs=True, steps=90)
+    belief, _ = beliefs(problem, (4.0,))
+    episode = problem.episode(np.full(9, 1.6), 5)
+    k = int(np.argmin(np.abs(SCALES - scale)))
+    scaled = belief.discrepancy.scaled(1.0).scaled(SCALES[k])
+    judged = belief.discrepancy.scaled(1.0)._off(episode).unmodelled[k, :, 0]
+    weights = scaled.lattice.weights(scaled._at(episode))
+    np.testing.assert_allclose(judged, scaled._parts[0].variance(weights), rtol=1e-6, atol=1e-14)
+    drawn = np.array([error.table[0] @ weights.T for error in scaled.errors(np.tile(belief.posterior.mode, (600, 1)), range(600))])
+    np.testing.assert_allclose(np.sum(drawn.var(axis=0)), np.sum(judged), rtol=0.25)
+
+
+def test_where_no_hyperparameters_are_found_they_are_the_prior_medians_and_nothing_is_random():
+    """A feature that is infinite has no likelihood. Matern 3/2 in closed form."""
+    draw = np.random.default_rng(0)
+    x, left, variance = np.full((1, 20, 2), np.inf), draw.standard_normal((1, 20)), np.full((1, 20), 1e-4)
+    nodes = draw.uniform(size=(1, 6, 2))
+    before = torch.random.get_rng_state()
+    with pytest.warns(SurrogateWarning, match="the error of the twin in 20 stretches could not be fitted"):
+        (found,) = _fit(x, left, variance, nodes)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    distance = np.sqrt(3.0) * np.linalg.norm((nodes[0, :, None] - nodes[0]) / LENGTH[:2], axis=-1)
+    np.testing.assert_allclose(found.kernel, (1 + distance) * np.exp(-distance), atol=1e-6)
+    assert found.variance == pytest.approx(np.mean(left**2))

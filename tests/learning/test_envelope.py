@@ -164,3 +164,11 @@ def test_nonsense_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match="envelope") as caught:
         Envelope(ChargingTwin(charge(ratios=(ResistanceRatio("R0"),))), **given)
     assert said in str(caught.value)
+
+
+def test_a_step_that_cannot_be_found_is_warned_of_and_theta_stays():
+    """HiGHS takes what is beyond 1e20 for infinite."""
+    problem = charge(ratios=(ResistanceRatio("R0"),), steps=60)
+    episode, theta = problem.episode(), problem.space.default
+    with pytest.warns(RuntimeWarning, match="has no solution, theta stays"):
+        np.testing.assert_array_equal(covering(problem.controller, episode, theta, problem.measured_rows(episode) + 1e25), theta)

@@ -17,6 +17,7 @@ from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner, safe_ask
 from chargetune.learning.ask import Ask
 from chargetune.learning.belief import believe, windows_of
+from chargetune.learning.discrepancy import SCALES
 from chargetune.learning.nearest import nearest
 from chargetune.learning.safe_ask import SafeAsk
 from chargetune.plants.sensors import Sensors
@@ -53,7 +54,8 @@ def test_three_trials_and_none_breaks_the_limit():
     trials, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 3)
     np.testing.assert_allclose(trials[0].theta, problem.space.upper)
     assert max(excess) <= 1.0
-    assert minutes[-1] <= 1.05 * 36.7
+    # A tenth is what the step back costs, where one of the plants that judge decides.
+    assert minutes[-1] <= 1.15 * 36.7
 
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
@@ -65,18 +67,30 @@ def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_nothing_is_risked_for_nothing(seed):
-    """The time to 60 % asks nothing of the backoff near full: there the charge stays as careful as it began."""
+def test_nothing_is_risked_for_nothing(seed, monkeypatch):
+    """The time to 60 % asks nothing of the backoff near full: there the charge stays more careful than where the time is won."""
+    sought = []
+
+    def noted(search, space, goal, theta, promised, allowed):
+        found = nearest(search, space, goal, theta, promised, allowed)
+        sought.append((goal, theta, found, promised, search.score(space.to_unit(found)).objective))
+        return found
+
+    monkeypatch.setattr(safe_ask, "nearest", noted)
     start = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
     problem = charge(seed, ratios=(), backoff=start, charge_time_to_soc=0.6)
     trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 3)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
-    # Not all the way: the curve through the nodes would bend down before them, where it is needed. Without the search for the nearest
-    # theta they are near 0 or below.
-    assert np.all(theta[9:] > 0.1)
-    assert np.all(theta[2:6] < 0.2)
+    assert np.mean(theta[9:]) > np.mean(theta[2:6])
     assert trials[-1].score.objective > trials[1].score.objective
+    # It is nearer to the best trial than what was aimed at, and wins as much, but for a thousandth, and a tenth of that for rounding.
+    aimed = [one for k, one in enumerate(sought) if k == 0 or one[1] is not sought[k - 1][2]]
+    distances = [(np.linalg.norm(found - goal), np.linalg.norm(aim - goal)) for goal, aim, found, *_ in aimed]
+    assert all(near <= far for near, far in distances)
+    assert any(near < 0.9 * far for near, far in distances)
+    for _, aim, found, promised, objective in sought:
+        assert objective >= promised - 1.1e-3 * abs(promised) or found is aim
 
 
 def test_temperature_and_anode_potential_are_kept_while_learning():
@@ -272,19 +286,62 @@ def test_less_is_kept_back_the_more_trials_were_foretold_and_never_less_than_the
     assert kept_back[-1] > norm.ppf(0.9 ** (1 / 3))
 
 
-def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
-    problem = charge(noise=0.0)
+def unforeseen(problem):
+    """Three trials whose voltages no circuit has."""
     trials = []
     for number, theta in enumerate((np.full(9, 3.0), np.full(9, 2.5), np.full(9, 2.0))):
         score, episode, _ = problem(theta, number)
         wrong = episode.output_end.copy()
         wrong[:, 0] += 0.3 * np.sin(np.arange(len(episode)) / 25 + 2 * number)
         trials.append(told(number, theta, score, replace(episode, output_end=wrong, output_start=wrong)))
-    tuner = TwinTuner(ChargingTwin(problem))
+    return trials
+
+
+def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
+    problem = charge(noise=0.0)
+    trials, tuner = unforeseen(problem), TwinTuner(ChargingTwin(problem))
     assert believe(tuner.loop, trials).mistake > 4
     with pytest.warns(RuntimeWarning, match="the black box's"):
         proposed = tuner.ask(problem.space, trials)
     assert proposed.shape == (1, 9)
+
+
+def test_a_twin_that_foresaw_nothing_is_not_asked_what_is_safe():
+    problem = charge(noise=0.0)
+    trials, tuner = unforeseen(problem), TwinTuner(ChargingTwin(problem), safety=Safety())
+    assert [t.score.feasible for t in trials] == [True] * 3
+    best = max(trials, key=lambda t: t.score.objective)
+    with pytest.warns(RuntimeWarning, match="did not foresee the last trial .* is proposed again"):
+        np.testing.assert_array_equal(tuner.ask(problem.space, trials, 2), [best.theta] * 2)
+    broken = [told(t.number, t.theta, replace(t.score, excess={"voltage_max_V": 1.0}), t.episode()) for t in trials]
+    with pytest.raises(NoSafeThetaError, match="no trial kept every limit; nothing was proposed"):
+        tuner.ask(problem.space, broken)
+
+
+def test_errors_beyond_every_scale_are_said():
+    ask, theta = after_one_charge()
+    ask = replace(ask, belief=replace(ask.belief, discrepancy=ask.belief.discrepancy.scaled(SCALES[-1])))
+    with pytest.warns(RuntimeWarning, match="more than it can allow for"):
+        np.testing.assert_array_equal(ask.thetas(), [theta])
+
+
+def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch):
+    """What comes out of the search is put where the limit breaks: a part of the way there is proposed, and it holds on other plants."""
+    ask, theta = after_one_charge()
+    monkeypatch.setattr(SafeAsk, "_nearer", lambda *_: np.full(9, 1.2))
+    assert not ask._holds(np.full(9, 1.2))
+    (proposed,) = ask.thetas()
+    assert ask.belief.predict(proposed, 100, 12345).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
+    assert 1.2 < proposed[0] < theta[0]
+    np.testing.assert_allclose(proposed, proposed[0])
+
+
+def test_trials_of_another_cell_are_refused():
+    problem = charge(noise=0.0)
+    score, episode, _ = problem(problem.space.upper, 0)
+    tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
+    with pytest.raises(ValueError, match="trials of earlier studies"):
+        tuner.ask(problem.space, [told(-1, problem.space.upper, score, episode)])
 
 
 def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():

@@ -150,3 +150,22 @@ def test_draws_are_reproducible_and_as_many_as_the_shares_say():
     drawn = [[part.number for part in posterior._parts(200, seed)] for seed in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]
     np.testing.assert_allclose(np.bincount(drawn[0], minlength=len(shares)), 200 * np.array(shares), atol=1.0)
+
+
+class Single:
+    """One unknown, and a loss that is steeper to one side."""
+
+    def values(self, e):
+        return np.array([e[0] / (1 + 0.2 * e[0]) if e[0] > 0 else e[0]])
+
+    def slopes(self, e):
+        return np.array([[1 / (1 + 0.2 * e[0]) ** 2 if e[0] > 0 else 1.0]])
+
+
+def test_of_a_single_unknown_there_are_no_others_to_find():
+    loss = Single()
+    found = sections(loss, np.zeros(1), np.eye(1), [0])
+    at, shares = np.array([one.mode[0] for one in found]), np.array([one.share for one in found])
+    density = np.array([np.exp(-0.5 * loss.values([x])[0] ** 2) for x in at])
+    np.testing.assert_allclose(shares, density / density.sum())
+    assert {one.root.shape for one in found} == {(1, 1)}

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from two_pairs import AnotherCell
+from two_pairs import AnotherCell, TwoPairs
 
 from chargetune.battery.cell import default_cell
 from chargetune.battery.charging import ChargingProblem, ResistanceRatio
@@ -18,6 +18,7 @@ from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
 from chargetune.learning import twin as twin_module
 from chargetune.learning.ask import Ask
 from chargetune.learning.belief import believe
+from chargetune.learning.misfit import Misfit
 from chargetune.learning.twin_tuner import cautious
 from chargetune.plants.sensors import Sensors
 
@@ -332,3 +333,24 @@ def test_a_safe_twin_takes_nothing_from_a_running_trial():
     first = tuner.ask(problem.space, [])
     running = [SimpleNamespace(number=0, theta=tuple(first[0]), status="running", score=None, episode=None)]
     np.testing.assert_array_equal(tuner.ask(problem.space, running), first)
+
+
+def test_a_posterior_is_that_of_the_spread_that_it_states():
+    """Mode, curvature and sections by the misfit with ``Posterior.spread``, on a plant that the twin cannot be."""
+    problem = charge(plant_model=TwoPairs(CELL), ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    episodes = [problem.episode(np.full(9, level), k) for k, level in enumerate((4.0, 2.0))]
+    twin = twin_of(problem)
+    posterior = twin.fit(episodes)
+    misfit = Misfit(twin, [(e.input, twin.measured(e)) for e in episodes], posterior.spread)
+    slopes = misfit.slopes(np.linalg.solve(twin.prior_factor, posterior.mode))
+    stated = twin.prior_factor @ np.linalg.inv(slopes.T @ slopes) @ twin.prior_factor.T
+    np.testing.assert_allclose(posterior.covariance, stated, rtol=1e-5, atol=1e-9)
+
+
+def test_only_what_was_not_measured_has_no_verdict():
+    problem = charge()
+    loop, episode = ChargingTwin(problem), problem.episode(problem.space.default, 0)
+    holed = replace(episode, output_end=np.full_like(episode.output_end, np.nan))
+    assert loop.score(holed) is None
+    with pytest.raises(ValueError, match="unknown output"):
+        loop.score(replace(episode, output_names=tuple(f"other {name}" for name in episode.output_names)))

@@ -29,12 +29,16 @@ from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["Backoff", "ChargingProblem", "PlantModel", "ResistanceRatio"]
+__all__ = ["Backoff", "ChargingProblem", "NotMeasuredError", "PlantModel", "ResistanceRatio"]
 
 # A violation of a limit that is noticed, in its unit: the solver's tolerance is relative to it.
 NOTICED = {"voltage": 0.1, "temperature": 1.0, "anode": 0.01}
 # The largest of some hundred means is that many standard deviations above the truth.
 NOISE_SD = 3.0
+
+
+class NotMeasuredError(ValueError):
+    """An episode has no verdict, because a measurement that it needs is missing or not finite."""
 
 
 class PlantModel(Protocol):
@@ -335,13 +339,13 @@ class ChargingProblem:
     def score(self, episode: Episode, *, metrics: bool = True) -> Score:
         """The verdict on what was measured, without figures for people where ``metrics`` is False.
 
-        Raises ValueError when a measurement is not a number.
+        Raises NotMeasuredError when a measurement is not a number.
         """
         _, soc = episode.signal("soc")
         measured = [values for limit in self.limits for values in episode.signal(limit.signal)]
         if not (len(soc) and all(np.all(np.isfinite(values)) for values in (*measured, soc))):
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
-            raise ValueError(f"the episode has no score: a measurement of {names} is missing or not finite")
+            raise NotMeasuredError(f"the episode has no score: a measurement of {names} is missing or not finite")
         deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
         samples = self.samples(episode)
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
@@ -412,7 +416,7 @@ class ChargingProblem:
             return None, episode, f"{episode.ending.value}: {episode.message}"
         try:
             return self.score(episode), episode, episode.ending.value
-        except ValueError as error:
+        except NotMeasuredError as error:
             return None, episode, f"{Ending.SENSOR.value}: {error}"
 
 

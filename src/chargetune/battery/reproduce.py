@@ -77,6 +77,11 @@ def make_tuner(
 
 def open_study(store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False) -> Study:
     """The study of a configuration, begun or resumed; see `Study.create_or_resume`."""
+    if config.safety and config.study.earlier:
+        raise ValueError(
+            "[safety] is given with [[study.earlier]]: the trials of an earlier study may be of another cell, and what that one allowed "
+            "is not known to be safe for this one; allowed is one of the two"
+        )
     problem = config.problem(folder)
     return Study.create_or_resume(
         store,

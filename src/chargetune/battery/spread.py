@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging import ChargingProblem, NotMeasuredError
 from chargetune.battery.checks import check_number
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.electrochemical import Electrochemical
@@ -114,5 +114,5 @@ class Variations:
             return None, episode
         try:
             return replace(own, sensors=Sensors()).score(episode.noise_free()), episode
-        except ValueError:
+        except NotMeasuredError:
             return None, episode

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging import ChargingProblem, NotMeasuredError
 from chargetune.battery.charging_check import stand_in
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.control.controller import Controller
@@ -34,8 +34,8 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
-# Plants that are remembered: those of two ensembles.
-PLANTS_KEPT = 128
+# Plants that are remembered: those that thetas are chosen by, and those that the chosen one is judged by.
+PLANTS_KEPT = 256
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 
@@ -145,7 +145,7 @@ class ChargingTwin:
         """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
         try:
             return self._exact.score(episode, metrics=False)
-        except ValueError:
+        except NotMeasuredError:
             return None
 
     def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:

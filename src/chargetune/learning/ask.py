@@ -79,7 +79,7 @@ class Ask:
         theta, predicted = candidate
         expected = self.belief.central(theta)
         score = None if expected is None else self.loop.score(expected)
-        if score is None:
+        if score is None or not predicted.scores:
             return candidate
         margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
         search = Search(self.loop, self.belief.expected, self.space, margin, self.aimed)

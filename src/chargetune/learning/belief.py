@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from chargetune.episode.cores import meanwhile
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.learning.discrepancy import Discrepancy, OutputError, scale_of
+from chargetune.learning.discrepancy import SCALES, Discrepancy, OutputError, scale_of
 from chargetune.learning.envelope import EnvelopeLoop
 from chargetune.learning.posterior import Posterior
 from chargetune.learning.tuner import TrialLike
@@ -25,6 +25,8 @@ __all__ = ["Belief", "Case", "Prediction", "Simulate", "TracedTrial", "TwinLoop"
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
 TRACES_MAX = 4
+# Times more wrong than allowed for, at which a twin is none.
+MISTAKEN = 3.5
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
 """thetas -> the episode of each on one simulated plant, None where it fails."""
@@ -89,6 +91,16 @@ class Belief:
     def proved(self) -> bool:
         """Whether there is a trial that those before it foretold."""
         return self.foretold > 0
+
+    @property
+    def mistaken(self) -> bool:
+        """Whether the newest trial was so far from what two or more before it foretold that the twin is none."""
+        return self.foretold > 1 and self.mistake >= MISTAKEN
+
+    @property
+    def beyond_scale(self) -> bool:
+        """Whether its errors may be larger than any scale that is told apart."""
+        return self.discrepancy is not None and self.discrepancy.scale >= SCALES[-1]
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
@@ -185,7 +197,7 @@ class Prediction:
     def excess(self) -> NDArray[np.float64]:
         """Excess less tolerance by plant and window, in tolerances, shape (plants, windows); nan where none was visited."""
         rows = [windows_of(score) for score in self.scores]
-        return np.array(rows).reshape(len(rows), -1)
+        return np.array(rows) if rows else np.empty((0, 0))
 
     def probability(self) -> float:
         """Share of the plants that keep every limit within its tolerance."""

@@ -11,19 +11,15 @@ import gpytorch
 import numpy as np
 import torch
 from botorch.acquisition.acquisition import AcquisitionFunction
-from botorch.exceptions.errors import ModelFittingError
-from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.models.utils.gpytorch_modules import get_covar_module_with_dim_scaled_prior
 from botorch.utils.transforms import t_batch_mode_transform
-from gpytorch.mlls import ExactMarginalLogLikelihood
-from linear_operator.utils.errors import NanError, NotPSDError
 from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.learning.failures import AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
-from chargetune.learning.surrogate import FIT_ITERATIONS, SurrogateWarning
+from chargetune.learning.surrogate import FIT_ITERATIONS, fitted
 from chargetune.learning.tuner import TrialLike, check_count, sobol_points
 from chargetune.model.parameters import ParameterSpace
 
@@ -279,23 +275,12 @@ def _fitted(x: torch.Tensor, y: torch.Tensor, variance: torch.Tensor) -> SingleT
 
     def fresh() -> SingleTaskGP:
         kernel = get_covar_module_with_dim_scaled_prior(ard_num_dims=x.shape[1], batch_shape=batch, use_rbf_kernel=False)
-        return SingleTaskGP(x, y, train_Yvar=variance, covar_module=kernel, outcome_transform=None)
+        with warnings.catch_warnings():
+            # Scaled by hand, because unknown values have no part in mean and sd.
+            warnings.simplefilter("ignore")
+            return SingleTaskGP(x, y, train_Yvar=variance, covar_module=kernel, outcome_transform=None)
 
-    with warnings.catch_warnings():
-        # Scaled by hand, because unknown values have no part in mean and sd; an iteration limit is no failure.
-        warnings.simplefilter("ignore")
-        model = fresh()
-        try:
-            fit_gpytorch_mll(
-                ExactMarginalLogLikelihood(model.likelihood, model),
-                optimizer_kwargs={"options": {"maxiter": FIT_ITERATIONS}},
-                max_attempts=1,
-            )
-            failure = None
-        except (ModelFittingError, NanError, NotPSDError, RuntimeError) as error:
-            failure, model = error, fresh()
-    if failure is not None:
-        warnings.warn(f"the processes of {len(x)} trials could not be fitted ({failure})", SurrogateWarning, stacklevel=2)
+    model = fitted(fresh, f"the model of {len(x)} trials", attempts=1, iterations=FIT_ITERATIONS)
     model.eval()
     return model
 

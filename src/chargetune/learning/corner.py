@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol
@@ -96,8 +97,15 @@ class _Linear:
         rows, jacobian = lines.near(radius, bent)
         matrix = np.hstack([jacobian, -np.ones((rows.size, 1))])
         bounds = [*zip(*lines.room(radius), strict=True), (0.0, None)]
-        found = linprog(np.append(lines.gradient, price), A_ub=matrix, b_ub=-rows, bounds=bounds, method="highs")
-        return (np.zeros(d), 0.0) if found.x is None else (found.x[:d], float(found.x[d]))
+        message = ""
+        # The simplex method gives up now and then where slopes are of many sizes; the interior point method does not.
+        for method in ("highs", "highs-ipm"):
+            found = linprog(np.append(lines.gradient, price), A_ub=matrix, b_ub=-rows, bounds=bounds, method=method)
+            if found.x is not None:
+                return found.x[:d], float(found.x[d])
+            message = found.message
+        warnings.warn(f"a linear program of {rows.size} rows failed, no step ({message})", RuntimeWarning, stacklevel=2)
+        return np.zeros(d), float(np.max(lines.rows + bent, initial=0.0))
 
     def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
         return -float(lines.gradient @ step)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from gpytorch.kernels import MaternKernel, ScaleKernel
 from gpytorch.means import ZeroMean
-from gpytorch.mlls import ExactMarginalLogLikelihood
 from gpytorch.priors import LogNormalPrior
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky
@@ -22,13 +20,17 @@ from chargetune.episode.cores import each
 from chargetune.episode.episode import Episode
 from chargetune.episode.lattice import Lattice
 from chargetune.learning.posterior import Posterior
+from chargetune.learning.search import reproducible
+from chargetune.learning.surrogate import fitted
 from chargetune.learning.twin import TOGETHER, blocks
 
-__all__ = ["Discrepancy", "Foretold", "OutputError", "scale_of"]
+__all__ = ["SCALES", "Discrepancy", "Foretold", "OutputError", "scale_of"]
 
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
 JITTER = 1e-8
+# Attempts of the search for hyperparameters, the first from the medians of their priors.
+ATTEMPTS = 5
 # Scales that are told apart.
 SCALES = np.geomspace(0.1, 10.0, 61)
 
@@ -43,9 +45,10 @@ class Foretold(NamedTuple):
 
 
 def scale_of(foretold: Sequence[Foretold], sure: float = 0.5) -> float:
-    """How many times larger than stated the discrepancy may be where nothing was measured, after these predictions.
+    """How many times larger than ``Twin.error_sd`` states the discrepancy may be where nothing was measured, after these predictions.
 
-    The factor s on its standard deviation that is not exceeded with probability ``sure``, ln s ~ N(0, 1) before the first of them.
+    The factor s on that floor, as `Discrepancy.scaled` applies it, that is not exceeded with probability ``sure``; ln s ~ N(0, 1) before
+    the first of them.
     """
     chance = -0.5 * np.log(SCALES) ** 2 + sum(one.chance for one in foretold)
     known_to = np.cumsum(np.exp(chance - np.max(chance)))
@@ -78,7 +81,7 @@ class Discrepancy:
             raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {len(LENGTH)}")
 
     def scaled(self, scale: float) -> Discrepancy:
-        """The same with another scale, which the hyperparameters do not depend on: they are those of the residuals."""
+        """The same with another factor on the floor ``Twin.error_sd``, not on what the residuals ask for, nor on the hyperparameters."""
         return replace(self, scale=scale, like=self)
 
     def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
@@ -103,16 +106,16 @@ class Discrepancy:
     def foretold(self, episode: Episode) -> Foretold:
         """How well an episode that was not learnt from was predicted, at its recorded inputs.
 
-        Each stretch of the episode differs by r ~ N(0, s^2 d^2 + v) from its prediction: d the standard deviation of the discrepancy,
-        v from noise and unknowns, s the scale. Neighbouring stretches err together, so `TOGETHER` of them count as one; and each counts
-        by the share of its prior variance that d^2 still is: what was measured before comes out as it was, however wrong the process is
-        elsewhere.
+        Each stretch of the episode differs by r ~ N(0, d_s^2 + v) from its prediction: d_s the standard deviation of the discrepancy with
+        the scale s (`scaled`), v from noise and unknowns. Neighbouring stretches err together, so `TOGETHER` of them count as one; and
+        each counts by the share of its prior variance that d_1^2 still is: what was measured before comes out as it was, however wrong
+        the process is elsewhere.
         """
         off = self._off(episode)
         known = off.known
         if not known.any():
             return Foretold(np.zeros_like(SCALES), 0.0)
-        variance = SCALES[:, None] ** 2 * off.unmodelled[known] + off.rest[known]
+        variance = off.unmodelled[:, known] + off.rest[known]
         chance = -0.5 * np.sum(off.novel[known] * (np.log(variance) + off.square[known] / variance), axis=1) / TOGETHER
         stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
         return Foretold(chance, float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))))
@@ -128,11 +131,28 @@ class Discrepancy:
         noise = np.array(list(twin.noise_sd.values()))
         own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
         weights = self.lattice.weights(self._at(episode))
-        unmodelled = np.stack([part.variance(weights) for part in self._parts], axis=1)
+        left_over = np.stack([part.variance(weights) for part in self._parts], axis=1)
         before = np.stack([part.variance_before(weights) for part in self._parts], axis=1)
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
-        novel = np.divide(unmodelled, before, out=np.zeros_like(before), where=before > 0)
-        return _Off(left**2, unmodelled, novel, rest, (counts > 0) & np.isfinite(left))
+        novel = np.divide(left_over, before, out=np.zeros_like(before), where=before > 0)
+        return _Off(left**2, self._variances(weights), novel, rest, (counts > 0) & np.isfinite(left))
+
+    def _variances(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance of the process with each of `SCALES` (`scaled`), at ``weights`` of the nodes (K, nodes); shape (scales, K, outputs)."""
+        data, seen = self.data, len(self.data.weights)
+        every = np.vstack([data.weights, weights])
+        out = np.empty((len(SCALES), len(weights), len(self.fitted)))
+        for i, (one, floor) in enumerate(zip(self.fitted, self._floors, strict=True)):
+            asked, stated = one.variance * one.kernel, np.outer(floor, floor) * one.kernel
+            # From all nodes to the stretches, which are fewer, once for all scales.
+            fixed, growing = every @ asked @ every.T, every @ stated @ every.T
+            for k, square in enumerate(SCALES**2):
+                both = fixed + square * growing
+                noise = data.variance[:, i] + JITTER * (asked[0, 0] + square * stated[0, 0])
+                cross = both[:seen, seen:]
+                taken = np.sum(cross * cho_solve(cho_factor(both[:seen, :seen] + np.diag(noise), lower=True), cross), axis=0)
+                out[k, :, i] = np.maximum(np.diag(both)[seen:] - taken, 0.0)
+        return out
 
     @cached_property
     def lattice(self) -> Lattice:
@@ -202,16 +222,21 @@ class Discrepancy:
         return _fit(data.at * on, left.T, data.variance.T, self.lattice.nodes * on)
 
     @cached_property
-    def _parts(self) -> tuple[_Part, ...]:
-        twin, nodes, inputs, data = self.posterior.twin, self.lattice.nodes, self._inputs, self.data
+    def _floors(self) -> tuple[NDArray[np.float64], ...]:
+        """By output, how far off it may be at each node however well the model fits elsewhere; without the scale."""
+        twin, nodes, inputs = self.posterior.twin, self.lattice.nodes, self._inputs
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
         flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs.any() else np.ones(len(nodes))
+        return tuple(twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing) for name in twin.noise_sd)
+
+    @cached_property
+    def _parts(self) -> tuple[_Part, ...]:
         parts = []
-        for i, (name, fitted) in enumerate(zip(twin.noise_sd, self.fitted, strict=True)):
-            least = self.scale * twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing)
+        for i, (one, floor) in enumerate(zip(self.fitted, self._floors, strict=True)):
             # One trajectory that the model fits says little of others.
-            parts.append(_part(fitted.kernel * (fitted.variance + np.outer(least, least)), data.variance[:, i], data.weights))
+            prior = one.kernel * (one.variance + self.scale**2 * np.outer(floor, floor))
+            parts.append(_part(prior, self.data.variance[:, i], self.data.weights))
         return tuple(parts)
 
 
@@ -237,14 +262,14 @@ class OutputError:
 
 
 class _Off(NamedTuple):
-    """A prediction beside what was measured, by stretch and output, each of shape (stretches, outputs)."""
+    """A prediction beside what was measured, by stretch and output, shape (stretches, outputs)."""
 
     square: NDArray[np.float64]
     """Squared error."""
     unmodelled: NDArray[np.float64]
-    """Its variance by the discrepancy."""
+    """Its variance by the discrepancy with each of `SCALES`, which are a first axis."""
     novel: NDArray[np.float64]
-    """The share that this is of what it was before any trial."""
+    """With the scale 1, the share that this is of what it was before any trial."""
     rest: NDArray[np.float64]
     """Variance by unknowns and noise."""
     known: NDArray[np.bool_]
@@ -303,24 +328,33 @@ class _Part:
 def _fit(
     x: NDArray[np.float64], left: NDArray[np.float64], variance: NDArray[np.float64], nodes: NDArray[np.float64]
 ) -> tuple[_Fitted, ...]:
-    """One process an output, all at once: x (outputs, n, d), residuals and their variance by noise (outputs, n), nodes (outputs, K, d)."""
+    """One process an output, all at once: x (outputs, n, d), residuals and their variance by noise (outputs, n), nodes (outputs, K, d).
+
+    Where no hyperparameters can be found they are the medians of their priors, and a `SurrogateWarning` says so. A second attempt begins
+    at a draw of them: of its own seed, so that the same residuals give the same process.
+    """
     sizes = np.sqrt(np.mean(left**2, axis=1))
     sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
     count, _, d = x.shape
     batch = torch.Size([count])
-    # In units of their prior medians all length scales have the same prior.
     medians = np.array(LENGTH[:d])
-    kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD), batch_shape=batch)
-    scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
-    model = SingleTaskGP(
-        torch.as_tensor(x / medians), torch.as_tensor(left / sizes)[..., None],
-        torch.as_tensor(np.minimum(variance / sizes**2, 1e6))[..., None],
-        covar_module=scaled, mean_module=ZeroMean(),
-        outcome_transform=None, input_transform=None,
-    )  # fmt: skip
-    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
-    with torch.no_grad():
-        kernels, scales = kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
+
+    def fresh() -> SingleTaskGP:
+        # In units of their prior medians all length scales have the same prior.
+        kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD), batch_shape=batch)
+        scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
+        kernel.lengthscale, scaled.outputscale = 1.0, 1.0
+        return SingleTaskGP(
+            torch.as_tensor(x / medians), torch.as_tensor(left / sizes)[..., None],
+            torch.as_tensor(np.minimum(variance / sizes**2, 1e6))[..., None],
+            covar_module=scaled, mean_module=ZeroMean(),
+            outcome_transform=None, input_transform=None,
+        )  # fmt: skip
+
+    with reproducible(0):
+        scaled: Any = fitted(fresh, f"the error of the twin in {x.shape[1]} stretches", attempts=ATTEMPTS).covar_module
+        with torch.no_grad():
+            kernels, scales = scaled.base_kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
     return tuple(_Fitted(k, float(size**2 * scale)) for k, size, scale in zip(kernels, sizes[:, 0], scales, strict=True))
 
 

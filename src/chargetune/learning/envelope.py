@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -151,7 +152,8 @@ def covering(
     In an interval whose input was at its bound, and which kept the limit nevertheless, only max(0, c_k(theta')) counts.
 
     c: predicted rows, linear in theta' around ``theta``; e: ``measured`` rows. A controller that keeps its limits with such a
-    theta keeps them on the plant wherever it was measured, and rides them. A linear program (HiGHS).
+    theta keeps them on the plant wherever it was measured, and rides them. A linear program (HiGHS); where that fails, with a
+    RuntimeWarning, theta as it is.
     Raises ValueError when there is nothing to cover.
     """
     lower, upper = controller.theta.lower, controller.theta.upper
@@ -184,6 +186,7 @@ def covering(
         # Presolve took two fifths of the time and saved no iteration.
         found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=bounds, method="highs", options={"presolve": False})
         if found.x is None:
+            warnings.warn(f"an envelope step of {n} samples has no solution, theta stays ({found.message})", RuntimeWarning, stacklevel=2)
             return theta
         before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
         if number + 1 == LINEARISATIONS or _rolled(controller).straight:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -111,7 +112,12 @@ class _LeastDistance:
         least = np.concatenate([rows, [0.0], low / self.whole, -high / self.whole]) - matrix @ aim
         # min |z| s.t. G z >= h:  with w >= 0 of least |[G'; h'] w - (0, 1)|, and r the residual there, z_j = -r_j / r_last.
         every = np.vstack([matrix.T, least]) / np.linalg.norm(matrix, axis=1)
-        weights, _ = nnls(every, np.append(np.zeros(size + 1), 1.0))
+        try:
+            weights, _ = nnls(every, np.append(np.zeros(size + 1), 1.0))
+        except RuntimeError as error:
+            # SciPy's limit of iterations.
+            warnings.warn(f"a least distance within {len(matrix)} lines was not found, no step ({error})", RuntimeWarning, stacklevel=2)
+            return np.zeros(size), float(np.max(rows, initial=0.0))
         residual = every @ weights
         residual[-1] -= 1.0
         step = np.clip(self.whole * (aim - residual[:-1] / residual[-1])[:size], low, high)

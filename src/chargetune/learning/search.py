@@ -9,9 +9,11 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 from botorch.acquisition.acquisition import AcquisitionFunction
+from botorch.exceptions.errors import CandidateGenerationError
 from botorch.optim.optimize import optimize_acqf
 from numpy.typing import NDArray
 
+from chargetune.learning.surrogate import FAILURES
 from chargetune.learning.tuner import sobol_points
 
 __all__ = ["candidates", "maximise", "reproducible"]
@@ -83,9 +85,9 @@ def maximise(
             )  # fmt: skip
         if value is not None and torch.isfinite(value).all() and torch.isfinite(found).all():
             best = found[0]
-    except (RuntimeError, ValueError):
-        # A flat or ill-conditioned acquisition: the best candidate stands.
-        pass
+    except (*FAILURES, CandidateGenerationError) as error:
+        # A flat or ill-conditioned acquisition.
+        warnings.warn(f"the acquisition was not maximised, the best of {len(points)} points stands ({error})", RuntimeWarning, stacklevel=2)
     done = torch.as_tensor(np.asarray(taken, dtype=float)).reshape(-1, d)
     if len(done) and (done - best).abs().amax(1).min() < DUPLICATE:
         order = values.argsort(descending=True)

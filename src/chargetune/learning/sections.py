@@ -113,6 +113,12 @@ class _Walk:
             def whole(rest: NDArray[np.float64]) -> NDArray[np.float64]:
                 return np.insert(rest, j, value)
 
+            if not others.any():
+                # One unknown: nothing is left to be found, and nothing to be uncertain of.
+                at = whole(np.zeros(0))
+                loss = float(np.sum(self._loss.values(at) ** 2))
+                self._known[k] = _At(-0.5 * loss, at, np.zeros((1, 0)), loss)
+                return self._known[k]
             # From the neighbour, or where Laplace's Gaussian has the others.
             neighbour = self._known.get(k - int(np.sign(k)))
             begin = neighbour.mode if neighbour else self._mode + k * (self._root @ self._root[j]) / self._sd

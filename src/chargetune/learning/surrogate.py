@@ -9,7 +9,7 @@ from typing import Any
 
 import gpytorch
 import torch
-from botorch.exceptions.errors import ModelFittingError
+from botorch.exceptions.errors import ModelFittingError, OptimizationGradientError
 from botorch.fit import fit_gpytorch_mll
 from botorch.models import SingleTaskGP
 from botorch.models.transforms.outcome import Standardize
@@ -20,12 +20,15 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.means import Mean
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from linear_operator.utils.errors import NanError, NotPSDError
+from torch.linalg import LinAlgError  # type: ignore[attr-defined] # documented, but not in its __all__
 
-__all__ = ["GaussianProcess", "SurrogateWarning", "posterior"]
+__all__ = ["FAILURES", "GaussianProcess", "SurrogateWarning", "fitted", "posterior"]
 
 # Nothing here needs more iterations: later ones change the hyperparameters in their third digit.
 FIT_ITERATIONS = 30
 NOISE_LEAST = 1e-6
+# What a matrix that is singular to rounding, or a flat function, ends with; anything else is a mistake in the program.
+FAILURES = (ModelFittingError, OptimizationGradientError, NanError, NotPSDError, LinAlgError)
 
 
 class SurrogateWarning(UserWarning):
@@ -66,21 +69,7 @@ class GaussianProcess:
             raise ValueError(f"surrogate: x has shape {tuple(x.shape)} and y {tuple(y.shape)}, expected (n, d) and (n, m) with n >= 1")
         if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
             raise ValueError("surrogate: x and y must be finite")
-        model = self._model(x, y)
-        start = {name: value.clone() for name, value in model.state_dict().items()}
-        try:
-            with warnings.catch_warnings():
-                # An iteration limit is no failure here, see FIT_ITERATIONS.
-                warnings.simplefilter("ignore")
-                fit_gpytorch_mll(
-                    ExactMarginalLogLikelihood(model.likelihood, model),
-                    optimizer_kwargs={"options": {"maxiter": self.iterations}},
-                    max_attempts=2,
-                )
-        except (ModelFittingError, NanError, NotPSDError, RuntimeError) as error:
-            warnings.warn(f"the surrogate of {len(y)} trials could not be fitted ({error})", SurrogateWarning, stacklevel=2)
-            model = self._model(x, y)
-            model.load_state_dict(start)
+        model = fitted(lambda: self._model(x, y), f"the surrogate of {len(y)} trials", attempts=2, iterations=self.iterations)
         model.eval()
         return model
 
@@ -111,6 +100,25 @@ class GaussianProcess:
                 outcome_transform=Standardize(m) if self.standardise else None,
             )
         return model.to(x)
+
+
+def fitted(make: Callable[[], SingleTaskGP], what: str, *, attempts: int, iterations: int | None = None) -> SingleTaskGP:
+    """What ``make`` gives, with the hyperparameters of the largest marginal likelihood times priors.
+
+    Where they cannot be found (`FAILURES`) it keeps those it begins with, and a `SurrogateWarning` says so. Further ``attempts`` begin at
+    a draw of torch's global generator: it has to be called within `reproducible`.
+    """
+    model = make()
+    options = None if iterations is None else {"options": {"maxiter": iterations}}
+    try:
+        with warnings.catch_warnings():
+            # An iteration limit is no failure here, see FIT_ITERATIONS.
+            warnings.simplefilter("ignore")
+            fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model), optimizer_kwargs=options, max_attempts=attempts)
+    except FAILURES as error:
+        warnings.warn(f"{what} could not be fitted ({error})", SurrogateWarning, stacklevel=3)
+        model = make()
+    return model
 
 
 def posterior(model: SingleTaskGP, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -233,11 +233,12 @@ class Twin:
             modes.append(factor @ e)
             if not (data and discrepancy):
                 break
-            before = spread
             predicted = self.predict_each(factor @ e, [u for u, _ in data])
-            unmodelled, spread = _unmodelled([y - own for (_, y), own in zip(data, predicted, strict=True)], noise)
-            if np.allclose(spread, before, rtol=0.02):
+            unmodelled, following = _unmodelled([y - own for (_, y), own in zip(data, predicted, strict=True)], noise)
+            # Mode, curvature, sections and draws belong to the spread of the last fit: after it there is no new one.
+            if k == REFITS or np.allclose(following, spread, rtol=0.02):
                 break
+            spread = following
         # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.
         curvature, directions = np.linalg.eigh(cost_jacobian.T @ cost_jacobian)
         root = factor @ (directions / np.sqrt(curvature))

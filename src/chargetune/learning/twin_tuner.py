@@ -22,8 +22,6 @@ from chargetune.model.parameters import ParameterSpace
 
 __all__ = ["TwinTuner", "cautious"]
 
-# Times more wrong than allowed for, at which a twin is none.
-MISTAKEN = 3.5
 # Standard deviations that are taken back where nothing is promised; the acquisition chooses, none among them.
 CAUTION = (2.0, 3.0)
 # Of a trial that is the result, the probability of keeping every limit: a half, less two standard errors of an ensemble of 32.
@@ -49,14 +47,17 @@ class TwinTuner:
     trials give the same thetas. Without a single trace the design is Sobol's.
 
     Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
-    is no twin, and the black box `ConstrainedLogEI` proposes, with a warning.
+    is no twin, and the black box `ConstrainedLogEI` proposes, with a warning. With ``safety`` it is the best trial that kept the
+    limits again.
 
     With ``safety`` the theta is one whose controller predicts the upper side of the belief: envelope steps (`covering`) on mean
     plus some sd of an ensemble of plants. Candidates are those that keep every limit on a share of the ensemble of at least the
-    stated probability, and the same acquisition picks; the first theta is the declared start, or the most cautious corner. Where
+    stated probability, and the same acquisition picks; the first theta is the declared start, or the most cautious corner. What is
+    proposed has to keep them as surely on an ensemble that nothing was chosen by. Where
     no such theta is found the best one tried that is still predicted to be safe is proposed again, with a warning; where there is
     none, or the budget of violation is spent, `NoSafeThetaError` is raised and nothing reaches the plant. Further thetas of a batch,
     and those proposed beside running trials, are the other candidates that passed; where there are too few they are repeated.
+    Trials of earlier studies are refused (ValueError): what another cell allowed is not known to be safe for this one.
     """
 
     loop: TwinLoop
@@ -67,7 +68,7 @@ class TwinTuner:
     iterations: int = 10
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
-        """``n`` thetas, shape (n, d). Raises ValueError when n is no count, `NoSafeThetaError`."""
+        """``n`` thetas, shape (n, d). Raises ValueError when n is no count or a safe study has earlier trials, `NoSafeThetaError`."""
         check_count(n)
         # Its matrices are small: a second thread mostly waits, and on a busy machine it waits ten times as long as one works.
         with threadpool_limits(1):
@@ -76,16 +77,21 @@ class TwinTuner:
     def _ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int) -> NDArray[np.float64]:
         if self.safety:
             # A trial that is running has shown nothing yet, and what it tries need not be tried twice.
+            if any(t.number < 0 for t in trials):
+                raise ValueError(
+                    "safety: there are trials of earlier studies; what another cell allowed is not known to be safe for this one, "
+                    "allowed are this study's own trials"
+                )
             running = [np.array(t.theta) for t in trials if t.status == "running"]
             done = [t for t in trials if t.status != "running"]
-            safe = self._safe_ask(space, done, self.safety).thetas()
+            safe = self._safe_ask(space, done, self.safety).thetas(n + len(running))
             fresh = [theta for theta in safe if not any(np.array_equal(theta, other) for other in running)] or safe
             return np.array([fresh[i % len(fresh)] for i in range(n)])
         belief = believe(self.loop, trials) if trials else None
         if belief is None or belief.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
             return out[:n]
-        if belief.mistake >= MISTAKEN and len(trials) > 2:
+        if belief.mistaken:
             warnings.warn(
                 f"the twin did not foresee the last trial (off by {belief.mistake:.0f} times what it allows for): "
                 "this proposal is the black box's",
