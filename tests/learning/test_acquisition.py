@@ -12,11 +12,12 @@ from botorch.acquisition.analytic import LogConstrainedExpectedImprovement, LogE
 from botorch.models import ModelListGP
 
 from chargetune.episode.score import Score
-from chargetune.learning.constrained import _ExpectedImprovement, limits_of, marginals
+from chargetune.learning.constrained import _ExpectedImprovement, _Models, limits_of, marginals
 from chargetune.learning.expected_improvement import expected_improvement
 from chargetune.learning.failures import RADIUS, AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
 from chargetune.learning.surrogate import GaussianProcess
+from chargetune.study.trial import Trial, TrialStatus
 
 RNG = np.random.default_rng(0)
 X = torch.tensor(RNG.uniform(size=(15, 2)))
@@ -120,3 +121,14 @@ def test_a_limit_out_of_reach_is_left_out(values):
 def test_tolerance_zero_works():
     (limit,) = limits_of([Trial(score(v, tolerance=0.0)) for v in (-0.2, 0.1, 0.3, 0.0)])
     np.testing.assert_array_equal(limit.values <= limit.bound, [True, False, False, True])
+
+
+def test_where_no_trial_keeps_the_limits_the_incumbent_is_the_closest_in_tolerances():
+    """0.5 V over with 1 K to spare is further away than 1.5 mV and 0.6 K over, which as plain numbers are more."""
+    tolerance = {"V": 0.001, "K": 0.5}
+    excesses = [(0.5, -1.0), (0.0025, 0.6), (0.3, 0.0)]
+    scores = [Score(-1.0 - n, 0.0, dict(zip(tolerance, pair, strict=True)), tolerance) for n, pair in enumerate(excesses)]
+    done = [Trial(n, (0.1 + 0.3 * n,), TrialStatus.DONE, score) for n, score in enumerate(scores)]
+    x = torch.tensor([t.theta for t in done], dtype=torch.double)
+    models = _Models.fit(GaussianProcess(), x, done)
+    assert (models.incumbent, models.best) == (1, None)

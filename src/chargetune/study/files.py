@@ -11,12 +11,12 @@ __all__ = ["write_whole"]
 def write_whole(path: str | os.PathLike[str], content: str | bytes) -> Path:
     """Write a file, text as UTF-8; a crash at any moment leaves the old file or the new one. Raises OSError."""
     target = Path(path)
+    data = content.encode() if isinstance(content, str) else content
+    if target.exists() and not target.is_file():  # a terminal, a pipe
+        target.write_bytes(data)
+        return target
     # A link stays a link, and what it leads to is replaced.
     place = target.resolve()
-    data = content.encode() if isinstance(content, str) else content
-    if place.exists() and not place.is_file():  # a terminal, a pipe
-        place.write_bytes(data)
-        return target
     aside = place.with_name(f".{place.name}.{os.getpid()}.new")
     try:
         with aside.open("wb") as file:
