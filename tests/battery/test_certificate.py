@@ -289,7 +289,7 @@ def test_each_start_that_may_be_drawn_is_charged(changes, width):
 
 
 def test_the_drawn_start_is_scored_from_there():
-    problem = forced(current_min_A=0.0, steps=60)
+    problem = forced(current_min_A=0.0, steps=60, backoff=Backoff(nodes=2, upper_V=0.02))
     draw = Spread().draw(problem, 0, 0)
     draw = replace(draw, soc_start=0.75, factors=dict.fromkeys(draw.factors, 1.0))
     score, episode = Variations(problem).run(draw, THETA)

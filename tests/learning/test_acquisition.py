@@ -17,7 +17,6 @@ from chargetune.learning.expected_improvement import expected_improvement
 from chargetune.learning.failures import RADIUS, AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
 from chargetune.learning.surrogate import GaussianProcess
-from chargetune.study.trial import Trial, TrialStatus
 
 RNG = np.random.default_rng(0)
 X = torch.tensor(RNG.uniform(size=(15, 2)))
@@ -128,7 +127,6 @@ def test_where_no_trial_keeps_the_limits_the_incumbent_is_the_closest_in_toleran
     tolerance = {"V": 0.001, "K": 0.5}
     excesses = [(0.5, -1.0), (0.0025, 0.6), (0.3, 0.0)]
     scores = [Score(-1.0 - n, 0.0, dict(zip(tolerance, pair, strict=True)), tolerance) for n, pair in enumerate(excesses)]
-    done = [Trial(n, (0.1 + 0.3 * n,), TrialStatus.DONE, score) for n, score in enumerate(scores)]
-    x = torch.tensor([t.theta for t in done], dtype=torch.double)
-    models = _Models.fit(GaussianProcess(), x, done)
+    x = torch.tensor([[0.1], [0.4], [0.7]], dtype=torch.double)
+    models = _Models.fit(GaussianProcess(), x, [Trial(one) for one in scores])
     assert (models.incumbent, models.best) == (1, None)
