@@ -74,7 +74,8 @@ def measured_result(trials: Sequence[Trial], *, by_performance: bool = False, as
     """
     scored = [t for t in trials if t.score is not None]
     if not scored:
-        return StudyResult(None, Reason.NONE, asked)
+        # There is nothing that a tuner could be asked.
+        return StudyResult(None, Reason.NONE)
     if by_performance:
         return StudyResult(best_performance(scored), Reason.PERFORMANCE, asked)
     best = best_feasible(scored)
