@@ -36,11 +36,11 @@ from rich.progress import track
 from rich.table import Column, Table
 
 from chargetune import learning
-from chargetune.battery.reproduce import tuned_trial
 from chargetune.battery.twin import ChargingTwin
 from chargetune.battery.windows import ChargingWindows
 from chargetune.learning.tuner import sobol_points
 from chargetune.learning.twin_search import Search
+from chargetune.study.result import measured_result
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0
 NEWEST, BELIEVED = ("safe", "ilc"), ("twin", "composite")
@@ -164,7 +164,7 @@ def _recommended(method: str, tuner: Any, problem: Any, told: list[Any]) -> int:
     if method in BELIEVED:
         best = tuner.best(problem.space, told)
     else:
-        trial = tuned_trial(told, "default")
+        trial = measured_result(told).trial
         best = None if trial is None else trial.number
     return len(told) - 1 if best is None else int(best)
 

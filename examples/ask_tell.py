@@ -35,8 +35,9 @@ def main(trials, path):
                 study.tell(trial.number, score, episode)
                 m = score.metrics
                 print(f"trial {trial.number}: overshoot {m['overshoot_mV']:6.1f} mV, t80 {m['t80_min'] or float('nan'):.1f} min")
-        best = study.best()
-    print("no trial kept the limits" if best is None else f"best: trial {best.number}, theta = {[round(v, 4) for v in best.theta]}")
+        result = study.result()
+    best = result.kept
+    print("no trial kept the limits" if best is None else f"result: trial {best.number}, theta = {[round(v, 4) for v in best.theta]}")
 
 
 if __name__ == "__main__":

@@ -184,10 +184,14 @@ def test_a_true_certificate_is_verified_and_says_what_was_judged(certificate):
     stated = json.loads(certificate.read_text())
     assert verify(certificate) == []
     assert 0 < stated["figures"]["violations"] < 12
-    with np.load(certificate.with_suffix(".npz")) as archive:
+    with np.load(traces_of(certificate)) as archive:
         # Judged without noise, kept as measured too.
         noise = archive["measured_end.voltage_V"] - archive["end.voltage_V"]
         assert noise.std() == pytest.approx(0.002, rel=0.25)
+
+
+def traces_of(path):
+    return path.with_name(json.loads(path.read_text())["traces"]["file"])
 
 
 def resealed(path, change):
@@ -236,7 +240,7 @@ def test_a_changed_theta_breaks_the_seal(certificate):
 
 
 def test_changed_traces_are_named_by_their_hash_and_by_the_figures(certificate):
-    traces = certificate.with_suffix(".npz")
+    traces = traces_of(certificate)
     with np.load(traces) as archive:
         arrays = {name: archive[name] for name in archive.files}
     arrays["end.voltage_V"] = np.minimum(arrays["end.voltage_V"], 4.2)
@@ -263,3 +267,82 @@ def test_both_ways_to_the_bound_agree(violations, episodes):
     assert upper_bound(violations, episodes, 0.95) == pytest.approx(violation_bound(violations, episodes, 0.95), rel=1e-10)
     if not violations:
         assert upper_bound(0, episodes, 0.95) == pytest.approx(1 - 0.05 ** (1 / episodes), rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("changes", "width"),
+    [
+        ({"soc_start": 0.05, "soc_start_error": -0.04}, 0.03),
+        ({"soc_start": 0.6, "soc_start_error": 0.3, "soc_target": 1.0}, 0.3),
+        ({"soc_start": 0.6, "charge_time_to_soc": 0.65}, 0.2),
+        ({"soc_start": 0.85, "soc_target": 1.0, "voltage_max_V": 4.1}, 0.1),
+    ],
+)
+def test_each_start_that_may_be_drawn_is_charged(changes, width):
+    """Drawn may be what no problem may state: an estimate beyond empty or full, a start past the mark, a cell at rest above its limit."""
+    problem = forced(current_min_A=0.0, backoff=Backoff(nodes=2, upper_V=0.02), **changes)
+    everything = charges(problem, replace(NONE, soc_start=width), 12)
+    starts = np.array([charge.draw.soc_start for charge in everything])
+    assert np.ptp(starts) > 0.5 * width
+    for charge in everything:
+        assert charge.score is not None, charge.episode.message
+
+
+def test_the_drawn_start_is_scored_from_there():
+    problem = forced(current_min_A=0.0, steps=60, backoff=Backoff(nodes=2, upper_V=0.02))
+    draw = Spread().draw(problem, 0, 0)
+    draw = replace(draw, soc_start=0.75, factors=dict.fromkeys(draw.factors, 1.0))
+    score, episode = Variations(problem).run(draw, THETA)
+    same = replace(problem, soc_start=0.75)
+    expected, other, _ = same(np.array(THETA), draw.seed)
+    np.testing.assert_allclose(episode.input, other.input, atol=1e-6)
+    assert score.objective == pytest.approx(expected.objective, rel=1e-6)
+    assert score.metrics["t80_min"] == pytest.approx(expected.metrics["t80_min"], rel=1e-5)
+
+
+def killed(path, at, monkeypatch, everything):
+    """Write a second certificate over the first, and die just before change ``at`` of the folder; the changes so far."""
+    seen = []
+
+    def step(real):
+        def run(place, *arguments, **settings):
+            if len(seen) == at:
+                raise SystemExit("killed")
+            seen.append(place.name)
+            return real(place, *arguments, **settings)
+
+        return run
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(path), "replace", step(type(path).replace))
+        patch.setattr(type(path), "unlink", step(type(path).unlink))
+        try:
+            write_certificate(
+                path, forced(sensors=Sensors({"voltage_V": 0.002}), soc_start=0.5), everything,
+                theta={"backoff_V[0]": 0.0, "backoff_V[1]": 0.0}, origin={"study": "s", "trial": 1}, spread=MODEST, seed=1, confidence=0.95,
+            )  # fmt: skip
+        except SystemExit:
+            return True
+    return False
+
+
+def test_a_certificate_is_replaced_as_a_whole(certificate, monkeypatch):
+    everything = charges(forced(sensors=Sensors({"voltage_V": 0.002}), soc_start=0.5), MODEST, 12, seed=1)
+    certificate.with_suffix(".png").write_bytes(b"figure of the old one")
+    bystander = certificate.with_name("c-notes.npz")
+    bystander.write_bytes(b"somebody else's")
+    trials = []
+    for at in range(20):
+        dead = killed(certificate, at, monkeypatch, everything)
+        assert verify(certificate) == [], f"killed before change {at}"
+        trials.append(json.loads(certificate.read_text())["origin"]["trial"])
+        assert not (certificate.with_suffix(".png").exists() and trials[-1]), "the old figure is beside the new certificate"
+        if not dead:
+            break
+    assert not dead
+    assert trials[0] == 0
+    assert sorted(trials) == trials
+    assert trials[-1] == 1
+    stated = json.loads(certificate.read_text())
+    assert bystander.exists()
+    assert stated["traces"]["file"] == f"c-{stated['traces']['sha256'][:12]}.npz"

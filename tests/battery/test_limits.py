@@ -134,6 +134,37 @@ def test_moving_mean_by_hand():
     assert moving_mean(np.zeros(0), 3).size == 0
 
 
+@pytest.mark.parametrize("samples", [1, 2, 3, 4, 9])
+def test_a_lost_sample_is_left_out_of_the_mean_and_spoils_no_other(samples):
+    draw = np.random.default_rng(4)
+    values = draw.normal(size=40)
+    values[[0, 7, 8, 9, 10, 11, 20]] = [np.nan, np.nan, np.inf, np.nan, np.nan, -np.inf, np.nan]
+    found = moving_mean(values, samples)
+    for k in range(values.size):
+        part = values[max(0, k - samples // 2) : k + (samples - 1) // 2 + 1]
+        known = part[np.isfinite(part)]
+        if samples > 1:
+            assert found[k] == pytest.approx(np.mean(known)) if known.size else np.isnan(found[k]), k
+
+
+@pytest.mark.parametrize("samples", [1, 5])
+@pytest.mark.parametrize("lost", [[3], [3, 4, 5], list(range(2, 9)), [0], [39]])
+def test_what_was_lost_costs_the_budget_of_violation_what_is_beside_it_does(by_hand, samples, lost):
+    """30 mV over the limit in every interval: the overshoot is known, and no lost sample is a kept limit."""
+    noise = Sensors(noise_sd={"voltage_V": 0.002})
+    problem = ChargingProblem(CELL, mismatch_seed=None, sensors=noise, verdict_samples=samples)
+    limit = problem.limits[0]
+    both = np.column_stack([np.full(40, limit.bound + 0.03), np.full(40, 0.5)])
+    episode = replace(by_hand, output_start=both, output_end=both.copy(), time_s=10.0 * np.arange(40))
+    whole = problem.violation_mVs(episode)
+    assert whole == pytest.approx(40 * 10.0 * 1e3 * (0.03 - problem.judged(limit)[1]))
+    for one in (episode.output_start, episode.output_end):
+        one[lost, 0] = np.nan
+    assert problem.violation_mVs(episode) == pytest.approx(whole)
+    episode.output_start[:, 0] = episode.output_end[:, 0] = np.nan
+    assert problem.violation_mVs(episode) == 0.0
+
+
 @pytest.mark.parametrize(
     ("cell", "changes", "said"),
     [

@@ -132,7 +132,7 @@ def test_migrate(run, tmp_path):
     shutil.copy(OLD, tmp_path / "old.db")
     code, _, err = run("store", "check", tmp_path / "old.db")
     assert code == 2
-    assert "schema version 1, allowed is 2; `chargetune store migrate`" in err
+    assert "schema version 1, allowed is 3; `chargetune store migrate`" in err
     code, out, _ = run("store", "migrate", tmp_path / "old.db")
     assert code == 0
     assert "has this program's schema" in out

@@ -12,6 +12,7 @@ from chargetune.battery.charging import ChargingProblem, ResistanceRatio
 from chargetune.battery.config import load_config
 from chargetune.battery.reproduce import make_tuner
 from chargetune.cli.tune import _closing
+from chargetune.study.result import Reason, StudyResult
 from chargetune.study.trial import Trial, TrialStatus
 
 STUDY = """
@@ -108,14 +109,13 @@ def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
         make_tuner(config.study.tuner, 0, problem, config.safety)
 
 
-def test_where_all_traces_call_another_trial_best_than_its_verdict_does_tune_says_so(capsys):
+def test_tune_says_which_trial_is_the_result_and_why(capsys):
     problem = ChargingProblem(default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0),))
     thetas = [np.full(9, 2.5), np.full(9, 3.0)]
     trials = [Trial(k, tuple(theta), status=TrialStatus.DONE, score=problem(theta, k)[0]) for k, theta in enumerate(thetas)]
-    _closing(problem, trials, trials[1])
+    _closing(problem, trials, StudyResult(trials[1], Reason.BELIEVED))
     said = " ".join(capsys.readouterr().out.split())
-    assert "Trial 1 is the best one by all traces together, trial 0 by its own noisy verdict." in said
-    assert "certify ... --trial 1" in said
+    assert "the result is trial 1: the tuner believes it best from all traces" in said
     assert "theta of trial 1:" in said
-    _closing(problem, trials, trials[0])
-    assert "by all traces" not in capsys.readouterr().out
+    _closing(problem, trials, StudyResult(trials[0], Reason.MEASURED))
+    assert "the result is trial 0: it is the best that was measured" in " ".join(capsys.readouterr().out.split())

@@ -13,7 +13,7 @@ from botorch.acquisition.analytic import LogConstrainedExpectedImprovement, LogE
 from botorch.models import ModelListGP
 
 from chargetune.episode.score import Score
-from chargetune.learning.constrained import _ExpectedImprovement, limits_of, marginals
+from chargetune.learning.constrained import _ExpectedImprovement, _Models, limits_of, marginals
 from chargetune.learning.expected_improvement import expected_improvement
 from chargetune.learning.failures import RADIUS, AwayFromFailures
 from chargetune.learning.search import candidates, maximise, reproducible
@@ -144,3 +144,13 @@ def test_a_search_that_fails_is_warned_of_and_a_mistake_is_none_of_its_failures(
         assert found[0] == points[:, 0].max()
         with pytest.raises(RuntimeError, match="shapes do not fit"):
             maximise(Rough("mistake"), points, X.numpy())
+
+
+def test_where_no_trial_keeps_the_limits_the_incumbent_is_the_closest_in_tolerances():
+    """0.5 V over with 1 K to spare is further away than 1.5 mV and 0.6 K over, which as plain numbers are more."""
+    tolerance = {"V": 0.001, "K": 0.5}
+    excesses = [(0.5, -1.0), (0.0025, 0.6), (0.3, 0.0)]
+    scores = [Score(-1.0 - n, 0.0, dict(zip(tolerance, pair, strict=True)), tolerance) for n, pair in enumerate(excesses)]
+    x = torch.tensor([[0.1], [0.4], [0.7]], dtype=torch.double)
+    models = _Models.fit(GaussianProcess(), x, [Trial(one) for one in scores])
+    assert (models.incumbent, models.best) == (1, None)

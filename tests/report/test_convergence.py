@@ -8,9 +8,11 @@ from report_studies import legend, lines
 from chargetune.episode.score import Score
 from chargetune.model.parameters import Parameter, ParameterSpace
 from chargetune.report import read_study
-from chargetune.report.convergence import convergence_figure, incumbents
+from chargetune.report.convergence import convergence_figure, excess_unit, incumbents, worst_excess
 from chargetune.report.reading import StudyView
+from chargetune.report.rows import study_head, trial_rows
 from chargetune.report.style import BLUE, GREEN, ORANGE, RED
+from chargetune.study.result import measured_result
 from chargetune.study.trial import Trial, TrialStatus
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -26,7 +28,37 @@ def view_of(outcomes, tuner="default"):
         else Trial(n, (0.1 * n,), DONE, Score(o[0], o[1], {"speed": o[2]}, {"speed": 0.5}))
         for n, o in enumerate(outcomes)
     ]
-    return StudyView("nowhere", "toy", tuner, ParameterSpace((Parameter("x", 0.0, 1.0, 0.0),)), tuple(trials), None)
+    result = measured_result(trials, by_performance=tuner == "ei")
+    return StudyView("nowhere", "toy", tuner, ParameterSpace((Parameter("x", 0.0, 1.0, 0.0),)), tuple(trials), None, result)
+
+
+def test_excesses_of_different_units_are_compared_in_tolerances():
+    """0.5 V over with 1 K to spare is far worse than 1.5 mV over and 0.6 K over, which as plain numbers are more."""
+    tolerance = {"voltage_max_V": 0.001, "temperature_max_K": 0.5}
+    excesses = [(0.5, -1.0), (0.0025, 0.6), (-0.01, -2.0)]
+    scores = [Score(-1.0, -1.0, dict(zip(tolerance, pair, strict=True)), tolerance) for pair in excesses]
+    trials = tuple(Trial(n, (0.1 * n,), DONE, score) for n, score in enumerate(scores))
+    view = replace(view_of([]), trials=trials, result=measured_result(trials[:2]))
+    assert view.tuned.number == 1
+    assert [worst_excess(view, score) for score in scores] == pytest.approx([499.0, 1.5, -5.0])
+    assert excess_unit(view)[1] == 1.0
+    lower = convergence_figure(view).axes[1]
+    assert "tolerances" in lower.get_ylabel()
+    assert [row["excess"] for row in trial_rows(view, trials)] == pytest.approx([499.0, 1.5, -5.0])
+    assert study_head(view)["tolerance"] is None
+    # Voltages of one tolerance are compared as they are, and told in mV.
+    volts = tuple(
+        replace(
+            t,
+            score=replace(
+                t.score, excess={"voltage_max_V": 0.002, "voltage_min_V": -0.1}, tolerance={"voltage_max_V": 0.001, "voltage_min_V": 0.001}
+            ),
+        )
+        for t in trials
+    )
+    alike = replace(view, trials=volts)
+    assert excess_unit(alike) == ("mV", 1e3)
+    assert worst_excess(alike, volts[0].score) == 0.002
 
 
 TABLE = [(-1.0, -9.0, 5.0), (-4.0, -4.0, 0.4), "failed", (-3.0, -5.0, 0.6), (-2.0, -6.0, 0.0), (-2.5, -2.5, -1.0), "running"]

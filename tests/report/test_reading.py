@@ -99,12 +99,3 @@ def test_reading_changes_nothing(stores):
 def test_import_leaves_matplotlib_and_torch_alone():
     code = "import sys, chargetune.report; sys.exit(str([m for m in ('matplotlib', 'torch') if m in sys.modules]))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stderr.strip() == "[]"
-
-
-def test_the_result_may_be_named(stores):
-    view = read_study(stores["mixed"], "charge", result=5)
-    assert view.tuned.number == 5
-    assert {t.number for t in view.others} == set(range(TRIALS)) - {0, 5}
-    for none in (-1, TRIALS):
-        with pytest.raises(ValueError, match=rf"result = {none}, allowed is .* 0 to {TRIALS - 1}"):
-            read_study(stores["mixed"], "charge", result=none)

@@ -48,3 +48,15 @@ def test_disagreement_and_a_current_beyond_its_bound(stores):
     assert next(c.name for c in recheck(view.problem, more, None) if not c.kept) == "current_max_A"
     assert recheck(view.problem, episode.cut(0, episode.ending, ""), None) == []
     assert np.isfinite([c.excess for c in recheck(view.problem, episode, None)]).all()
+
+
+def test_a_lost_sample_hides_no_other():
+    problem = replace(case_study("backoff", 0).problem(), steps=60, sensors=Sensors({"voltage_V": 2e-3}), verdict_samples=6)
+    episode = problem.episode(None, seed=3)
+    whole = {c.name: c for c in recheck(problem, episode, None)}
+    episode.output_end[20, 0] = np.nan
+    found = {c.name: c for c in recheck(problem, episode, None)}
+    assert found["voltage_max_V"].excess == pytest.approx(whole["voltage_max_V"].excess, abs=2e-3)
+    assert found["voltage_max_V"].kept == whole["voltage_max_V"].kept
+    episode.output_start[:, 0] = episode.output_end[:, 0] = np.nan
+    assert not any(c.kept for c in recheck(problem, episode, None) if c.name.startswith("voltage")), "nothing measured is nothing kept"

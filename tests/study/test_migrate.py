@@ -14,8 +14,10 @@ import pytest
 from sqlalchemy import Engine, event
 from study_toy import Toy, essence, open_study
 
+from chargetune.study.result import Reason, read_result
 from chargetune.study.schema import SCHEMA_VERSION
 from chargetune.study.store import Store, StoreError
+from chargetune.study.trial import best_feasible
 
 FORK = multiprocessing.get_context("fork")
 # Written by the program of schema 1: study "toy" (batch 2) with 8 told trials and one running, study "second" with 2.
@@ -66,6 +68,26 @@ def test_an_old_store_is_migrated_with_a_copy_and_its_study_goes_on(old, tmp_pat
         assert connection.execute("SELECT schema_version FROM chargetune_store ORDER BY 1").fetchall() == [(1,), (SCHEMA_VERSION,)]
 
 
+def test_the_second_schema_is_migrated_and_its_result_is_what_was_measured_until_the_tuner_is_asked(tmp_path):
+    # Written by the program of schema 2: study "toy" (batch 2) with 8 told trials and one running, study "second" with 2.
+    path = Path(shutil.copy(OLD.with_name("schema-2.db"), tmp_path / "s.db"))
+    with pytest.raises(StoreError, match=r"schema version 2, this program reads version 3; `chargetune store migrate .*s.db`"):
+        Store(path, read_only=True)
+    with Store(path) as store:
+        record = store.study("toy")
+        trials = store.trials(record.id)
+        assert [t.status for t in trials] == ["failed" if k == FAILED else "done" for k in range(8)] + ["running"]
+        found = read_result(store, record)
+        assert (found.trial, found.reason, found.asked) == (best_feasible(trials), Reason.MEASURED, False)
+        assert "the tuner was not asked" in found.sentence
+        with open_study(store, batch=2) as study:
+            study.run(Toy(), 10)
+        assert read_result(store, record).asked
+    Store(tmp_path / "new.db").close()
+    assert columns(path) == columns(tmp_path / "new.db")
+    assert (tmp_path / "s.db.schema-2").exists()
+
+
 def test_a_store_is_migrated_once_and_a_copy_is_never_overwritten(old, tmp_path):
     (tmp_path / "s.db.schema-1").write_text("of an earlier attempt")
     for _ in range(2):
@@ -76,7 +98,7 @@ def test_a_store_is_migrated_once_and_a_copy_is_never_overwritten(old, tmp_path)
 
 def test_reading_migrates_nothing_and_says_what_does(old):
     before = old.read_bytes()
-    with pytest.raises(StoreError, match=r"schema version 1, this program reads version 2; `chargetune store migrate .*s.db`"):
+    with pytest.raises(StoreError, match=r"schema version 1, this program reads version 3; `chargetune store migrate .*s.db`"):
         Store(old, read_only=True)
     assert old.read_bytes() == before
 

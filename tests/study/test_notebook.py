@@ -58,6 +58,7 @@ def test_a_study_shows_its_best_theta_with_units(store):
         assert shown.cells[0] == "trials"
         assert shown.after("trials") == f"24: {24 - failed} done, {failed} failed"
         assert shown.after("best trial") == str(best.number)
+        assert shown.after("why") == "it is the best that was measured to keep every limit"
         assert shown.after("x") == f"{best.theta[0]:.5g}"
         assert shown.after("objective") == f"{best.score.objective:.5g}"
         assert shown.after("t80_min") == "-"

@@ -15,6 +15,7 @@ from study_toy import Toy, essence, open_study
 from chargetune.episode.score import Score
 from chargetune.study import postgres as server
 from chargetune.study.database import database_at, store_name
+from chargetune.study.result import read_result
 from chargetune.study.store import Store, StoreError
 from chargetune.study.trace import encode
 from chargetune.study.trial import Trial
@@ -216,6 +217,28 @@ def test_reading_needs_no_right_to_write(postgres):
         finally:
             connection.execute(f"DROP OWNED BY {name}")
             connection.execute(f"DROP ROLE {name}")
+
+
+def test_a_store_of_schema_2_gets_its_table_of_results_and_reading_adds_nothing(postgres):
+    with Store(postgres) as store, open_study(store) as study:
+        study.run(Toy(), 3)
+        trials = study.trials()
+    with psycopg.connect(postgres, autocommit=True) as connection:
+        connection.execute("DROP TABLE chargetune.result")
+        connection.execute("UPDATE chargetune.chargetune_store SET schema_version = 2")
+    with pytest.raises(StoreError, match="schema version 2, this program knows version 3 on a server"):
+        Store(postgres, read_only=True)
+    with Store(postgres) as store:
+        record = store.study("toy")
+        assert store.trials(record.id) == trials
+        assert not read_result(store, record).asked
+        before = database_at(postgres).mark()
+        with open_study(store) as study:
+            found = study.result()
+        assert read_result(store, record) == found
+        assert found.asked
+        assert database_at(postgres).mark() != before, "a page is told that the result changed"
+    Store(postgres, read_only=True).close()
 
 
 def test_the_password_is_in_no_label():

@@ -221,36 +221,6 @@ def test_ctrl_c_stops_and_the_same_call_resumes(store, tmp_path, batch, workers)
     assert essence(store.trials(1)) == uninterrupted(tmp_path, batch=batch)
 
 
-@dataclass(frozen=True)
-class Believes(Halfway):
-    """Believes best the trial of this place among those it is shown, earlier studies' first."""
-
-    place: int = 0
-
-    def best(self, space, trials):
-        assert all(t.status is not TrialStatus.RUNNING for t in trials)
-        assert all(t.episode is not None for t in trials if t.trace_sha256 is not None)
-        return self.place
-
-
-def test_what_the_tuner_believes_best_is_a_trial_that_was_measured_to_keep_the_limits(store, tmp_path):
-    with open_study(store) as study:
-        study.run(Toy(), 24)
-        study.ask()
-        assert study.believed_best() is None
-        kept = [t.score is not None and t.score.feasible for t in study.trials()]
-        assert {True, False} == set(kept[:24])
-        for place in range(24):
-            found = replace(study, tuner=Believes(place=place)).believed_best(24)
-            assert (None if found is None else found.number) == (place if kept[place] else None)
-        earlier, first = tuple(t for t in study.trials() if t.status is not TrialStatus.RUNNING), kept.index(True)
-        with Store(tmp_path / "later.db") as other, open_study(other) as later:
-            later.run(Toy(), 24)
-            places = [replace(later, tuner=Believes(place=k), earlier=earlier).believed_best() for k in (first, len(earlier) + first)]
-    assert places[0] is None
-    assert places[1].number == first
-
-
 def test_progress_sees_incumbent_violations_and_failures(store):
     seen = []
     with open_study(store) as study:

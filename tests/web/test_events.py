@@ -7,6 +7,8 @@ import pytest
 from report_studies import TRIALS, charging, run_charging
 
 from chargetune.episode.score import Score
+from chargetune.study.records import ResultRecord
+from chargetune.study.result import made_from
 from chargetune.study.store import Store
 from chargetune.study.trial import Trial
 from chargetune.web import events
@@ -59,6 +61,13 @@ def test_a_study_is_told_whole_and_then_what_is_new(path):
         name, news = await following(stream)
         assert [(row["number"], row["status"]) for row in news["rows"]][-1] == (TRIALS, "done")
         assert news["tuned"] == TRIALS
+        assert not news["result"]["asked"]
+        # The tuner is asked when all trials are told: no trial is new then, and yet the result is.
+        with Store(path) as opened:
+            record = opened.study("charge")
+            opened.set_result(record.id, ResultRecord(2, "believed", made_from(record, opened.trials(record.id))))
+        name, news = await following(stream)
+        assert (name, news["rows"], news["tuned"], news["result"]["reason"]) == ("trials", [], 2, "believed")
         await stream.aclose()
 
     asyncio.run(client())
@@ -92,7 +101,10 @@ def test_a_study_without_trials_yet(tmp_path):
             opened.add_study("empty", identity)
         stream = study_events(StoreWatch(path), 1)
         assert (await following(stream))[0] == "study"
-        assert (await following(stream))[1] == {"rows": [], "untuned": None, "tuned": None, "tuned_label": "tuned"}
+        assert (await following(stream))[1] == {
+            "rows": [], "untuned": None, "tuned": None, "tuned_label": "tuned",
+            "result": {"trial": None, "reason": "none", "asked": True, "sentence": "no trial has a score"},
+        }  # fmt: skip
         tell(path, 0, tuple(config.problem().space.default), finish=False)
         assert await told(stream) == [0]
         await stream.aclose()

@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import Config, load_config, read_tables
-from chargetune.battery.reproduce import open_study, tuned_trial
-from chargetune.study.store import Store
+from chargetune.battery.reproduce import open_study
+from chargetune.study.result import Reason, StudyResult, read_result
+from chargetune.study.store import Store, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["Entry", "Standing", "load_campaign", "run_campaign", "standings"]
@@ -69,8 +70,13 @@ class Standing:
     trials: int
     failed: int
     violating: int
-    best: Trial | None
+    result: StudyResult
     message: str | None = None
+
+    @property
+    def best(self) -> Trial | None:
+        """The trial that is the study's result."""
+        return self.result.trial
 
     @property
     def state(self) -> str:
@@ -150,20 +156,19 @@ def run_campaign(
 
 def standings(store: Store, entries: Iterable[Entry]) -> dict[str, Standing]:
     """How far each study is, by name."""
-    ids = {record.name: record.id for record in store.studies()}
-    return {e.name: _count(e, store.trials(ids[e.name]) if e.name in ids else []) for e in entries}
+    records = {record.name: record for record in store.studies()}
+    return {e.name: _count(e, store, records.get(e.name)) for e in entries}
 
 
-def _count(entry: Entry, trials: Sequence[Trial], message: str | None = None) -> Standing:
-    wanted = trials[: entry.config.study.trials]
+def _count(entry: Entry, store: Store, record: StudyRecord | None) -> Standing:
+    wanted = [] if record is None else store.trials(record.id)[: entry.config.study.trials]
     return Standing(
         name=entry.name,
         told=sum(t.status is not TrialStatus.RUNNING for t in wanted),
         trials=entry.config.study.trials,
         failed=sum(t.status is TrialStatus.FAILED for t in wanted),
         violating=sum(t.score is not None and not t.score.feasible for t in wanted),
-        best=tuned_trial(wanted, entry.config.study.tuner),
-        message=message,
+        result=StudyResult(None, Reason.NONE) if record is None else read_result(store, record, wanted),
     )
 
 
@@ -178,7 +183,7 @@ def _standing(future: Future[Standing], entry: Entry, kept: str | Path, losses: 
             told, times = losses.get(entry.name, (-1, 0))
             losses[entry.name] = now.told, 1 if now.told > told else times + 1
             message = None if losses[entry.name][1] <= LOSSES_MAX else message
-        return Standing(now.name, now.told, now.trials, now.failed, now.violating, now.best, message)
+        return Standing(now.name, now.told, now.trials, now.failed, now.violating, now.result, message)
 
 
 def _turn(entry: Entry, kept: str | Path) -> Standing:
@@ -191,9 +196,13 @@ def _turn(entry: Entry, kept: str | Path) -> Standing:
             count = len(study.trials())
             # What a dead process left is told first, then one batch.
             limit = max(count, 1) if study.running() else (count // study.batch + 1) * study.batch
-            study.run(problem, min(limit, wanted))
-            standing = _count(entry, study.trials())
-            if standing.told >= wanted or time.monotonic() > end:
+            study.advance(problem, min(limit, wanted))
+            standing = _count(entry, store, study.record)
+            if standing.told >= wanted:
+                # Asking a tuner may take seconds, so it is asked once.
+                study.result()
+                return _count(entry, store, study.record)
+            if time.monotonic() > end:
                 return standing
 
 

@@ -1,14 +1,16 @@
 """Certificate: the tuned controller on fresh episodes, its violations counted, and a bound on their probability.
 
-Two files: the figures as JSON, and beside it the traces of every episode as a compressed NumPy archive, from which
+Two files: the figures as JSON, which names the other, and beside it the traces of every episode as a compressed NumPy archive, from which
 `chargetune.verify` recomputes each figure without any code of this package.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import asdict, dataclass
@@ -24,6 +26,7 @@ from chargetune.battery.spread import MEANING, Draw, Spread, Variations
 from chargetune.episode.bound import violation_bound
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
+from chargetune.study.files import write_whole
 from chargetune.study.provenance import utc_now, versions
 
 __all__ = ["FORMAT", "Charge", "figures", "run_charges", "write_certificate"]
@@ -111,10 +114,17 @@ def write_certificate(
     seed: int,
     confidence: float,
 ) -> dict[str, Any]:
-    """Write both files and give the certificate. ``origin`` says which study and trial theta is from."""
+    """Write both files and give the certificate. ``origin`` says which study and trial theta is from.
+
+    The traces' name holds their hash, ``NAME-0123456789ab.npz``, so that the certificate there was before keeps its own until the
+    new one takes its place: a crash at any moment leaves the old one whole or the new one. Then the old traces are deleted. A
+    figure beside it (``NAME.png``) is deleted first, it would be another certificate's.
+    """
     ordered = sorted(charges, key=lambda charge: charge.index)
-    traces = path.with_suffix(".npz")
-    np.savez_compressed(traces, allow_pickle=False, **_arrays(ordered))
+    archive = io.BytesIO()
+    np.savez_compressed(archive, allow_pickle=False, **_arrays(ordered))
+    digest = hashlib.sha256(archive.getvalue()).hexdigest()
+    traces = write_whole(path.with_name(f"{path.stem}-{digest[:12]}.npz"), archive.getvalue())
     certificate: dict[str, Any] = {
         "format": FORMAT,
         "made_at": utc_now(),
@@ -136,12 +146,26 @@ def write_certificate(
             for limit in problem.limits
         ],
         "figures": figures(ordered, {limit.name: limit.tolerance for limit in problem.limits}, confidence),
-        "traces": {"file": traces.name, "sha256": hashlib.sha256(traces.read_bytes()).hexdigest()},
+        "traces": {"file": traces.name, "sha256": digest},
     }
     content = json.dumps(certificate, sort_keys=True, separators=(",", ":"), allow_nan=False)
     certificate["sha256"] = hashlib.sha256(content.encode()).hexdigest()
-    path.write_text(json.dumps(certificate, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    old = _traces_of(path)
+    path.with_suffix(".png").unlink(missing_ok=True)
+    write_whole(path, json.dumps(certificate, indent=1, allow_nan=False) + "\n")
+    if old is not None and old != traces:
+        old.unlink(missing_ok=True)
     return certificate
+
+
+def _traces_of(path: Path) -> Path | None:
+    """The traces of the certificate that is there, None when there is none; never a file of another name than `write_certificate` gives."""
+    try:
+        name = str(json.loads(path.read_text(encoding="utf-8"))["traces"]["file"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    own = name == f"{path.stem}.npz" or re.fullmatch(re.escape(path.stem) + r"-[0-9a-f]{12}\.npz", name)
+    return path.with_name(name) if own else None
 
 
 def _portion(problem: ChargingProblem, theta: tuple[float, ...], spread: Spread, seed: int, part: Sequence[int]) -> list[Charge]:

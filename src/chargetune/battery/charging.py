@@ -336,8 +336,10 @@ class ChargingProblem:
         plant = self.plant
         return compiled_episode(self.controller, plant, self.steps) if isinstance(plant, SimulatedPlant) else None
 
-    def score(self, episode: Episode, *, metrics: bool = True) -> Score:
+    def score(self, episode: Episode, *, metrics: bool = True, soc_start: float | None = None) -> Score:
         """The verdict on what was measured, without figures for people where ``metrics`` is False.
+
+        ``soc_start``: the SOC that the episode began at, where it is not the problem's own.
 
         Raises NotMeasuredError when a measurement is not a number.
         """
@@ -346,15 +348,16 @@ class ChargingProblem:
         if not (len(soc) and all(np.all(np.isfinite(values)) for values in (*measured, soc))):
             names = ", ".join(dict.fromkeys([*(limit.signal for limit in self.limits), "soc"]))
             raise NotMeasuredError(f"the episode has no score: a measurement of {names} is missing or not finite")
-        deficit = (self.soc_target - np.concatenate([[self.soc_start], soc])) ** 2
+        start = self.soc_start if soc_start is None else soc_start
+        deficit = (self.soc_target - np.concatenate([[start], soc])) ** 2
         samples = self.samples(episode)
         over = np.maximum(0.0, self.limits[0].excess(episode)) ** 2
         return Score(
-            objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(soc),
+            objective=-float(np.mean(deficit)) if self.charge_time_to_soc is None else self._quickness(start, soc),
             performance=-float(self.c1 * np.sum(deficit) + np.sum(over)),
             excess={name: float(np.max(values)) for name, (values, _) in samples.items()},
             tolerance={limit.name: self.judged(limit)[1] for limit in self.limits},
-            metrics=self._metrics(episode) if metrics else {},
+            metrics=self._metrics(episode, start) if metrics else {},
             profile={name: _by_window(*pair, self.soc_windows) for name, pair in samples.items() if name != "voltage_min_V"},
         )
 
@@ -367,8 +370,8 @@ class ChargingProblem:
             for limit in self.limits
         }
 
-    def _metrics(self, episode: Episode) -> dict[str, float | None]:
-        metrics = charging_metrics(episode, self.voltage_max_V or 0.0, self.soc_start)
+    def _metrics(self, episode: Episode, start: float) -> dict[str, float | None]:
+        metrics = charging_metrics(episode, self.voltage_max_V or 0.0, start)
         # The current is an input and bounded hard; that it was is told, but it is nothing to learn.
         metrics["violation_mVs"] = self.violation_mVs(episode)
         metrics["current_max_excess_A"] = float(np.max(episode.input[:, 0]) - (self.current_max_A or 0.0))
@@ -376,10 +379,10 @@ class ChargingProblem:
             metrics |= limit.metrics(episode)
         return metrics
 
-    def _quickness(self, soc: NDArray[np.float64]) -> float:
+    def _quickness(self, start: float, soc: NDArray[np.float64]) -> float:
         wanted = self.charge_time_to_soc or 0.0
         time = np.arange(soc.size + 1) / soc.size
-        reached = crossing_minutes(60 * time, np.concatenate([[self.soc_start], soc]), wanted)
+        reached = crossing_minutes(60 * time, np.concatenate([[start], soc]), wanted)
         return -float(reached if reached is not None else 1.0 + wanted - soc[-1])
 
     def charge_time(self, score: Score) -> tuple[str, float | None]:
@@ -398,10 +401,19 @@ class ChargingProblem:
         return samples, limit.tolerance + NOISE_SD * noise / samples**0.5
 
     def violation_mVs(self, episode: Episode) -> float:
-        """Excess of the upper voltage limit beyond its tolerance, in the moving mean of the verdict, over time, mV s."""
+        """Excess of the upper voltage limit beyond its tolerance, in the moving mean of the verdict, over time, mV s.
+
+        An interval of which no sample is left counts as those beside it do, by linear interpolation: a lost sample is no kept
+        limit. 0 where nothing at all was measured.
+        """
         limit = self.limits[0]
         samples, tolerance = self.judged(limit)
-        beyond = np.maximum(0.0, np.nan_to_num(limit.excess(episode, samples)) - tolerance)
+        excess = limit.excess(episode, samples)
+        known = np.isfinite(excess)
+        if not known.any():
+            return 0.0
+        at = np.arange(excess.size)
+        beyond = np.maximum(0.0, np.interp(at, at[known], excess[known]) - tolerance)
         return float(1e3 * episode.sampling_time_s * np.sum(beyond))
 
     def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode, str]:

@@ -94,9 +94,9 @@ def _settings(problem: ChargingProblem) -> dict[str, float]:
 
 
 def _beyond(problem: ChargingProblem, theta: NDArray[np.float64]) -> float:
-    """The largest excess less its tolerance; infinite when the charge does not come to its end."""
+    """The largest excess less its tolerance, in tolerances; infinite when the charge does not come to its end."""
     score, _, _ = problem(theta, 0)
-    return np.inf if score is None else max(value - score.tolerance[name] for name, value in score.excess.items())
+    return np.inf if score is None else score.worst
 
 
 def _target(problem: ChargingProblem) -> list[Finding]:

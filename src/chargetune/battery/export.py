@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.study.document import space_from_json
+from chargetune.study.files import write_whole
 from chargetune.study.notebook import trials_dataframe
+from chargetune.study.result import read_result
 from chargetune.study.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial
 
@@ -69,7 +71,7 @@ def export(
 ) -> Exported:
     """Write each study, or the one named, into a folder of its own below ``folder``.
 
-    ``study.json``: identity and versions; ``trials.parquet``: one row a trial; ``trial-0007.bdf.parquet``: its trace. The trials
+    ``study.json``: identity, versions and result; ``trials.parquet``: one row a trial; ``trial-0007.bdf.parquet``: its trace. The trials
     of earlier studies (D_0) are among them with numbers below 0, as ``earlier-0003``. Existing files of these names are replaced.
 
     Raises ImportError without pandas (and pyarrow), StoreError for a study that is not there.
@@ -84,8 +86,8 @@ def export(
         place = Path(folder) / _folder_name(record, records)
         place.mkdir(parents=True, exist_ok=True)
         about = {"name": record.name, "created_at": record.created_at, "versions": record.versions, "identity": record.identity}
-        (place / "study.json").write_text(json.dumps(about, indent=1, ensure_ascii=False), encoding="utf-8")
-        files.append(place / "study.json")
+        about["result"] = read_result(store, record).facts()
+        files.append(write_whole(place / "study.json", json.dumps(about, indent=1, ensure_ascii=False)))
         frame = trials_dataframe(space_from_json(record.identity["space"]), trials)
         frame["seed"], frame["trace_sha256"] = [t.seed for t in trials], [t.trace_sha256 for t in trials]
         files.append(_write(frame.reset_index(), place / "trials", form))

@@ -66,11 +66,11 @@ class Limit:
     def excess(self, episode: Episode, samples: int = 1) -> NDArray[np.float64]:
         """By how much each interval is beyond the limit, the worse of its two ends, shape (K,).
 
-        ``samples`` > 1 judges the moving mean of as many intervals, for measurements with noise: the largest of 720
-        samples with a standard deviation of 2 mV is 6 mV above the truth.
+        A lost sample is left out; nan where nothing is known of an interval. ``samples`` > 1 judges the moving mean of as many
+        intervals, for measurements with noise: the largest of 720 samples with a standard deviation of 2 mV is 6 mV above the truth.
         """
         start, end = (moving_mean(values, samples) for values in episode.signal(self.signal))
-        return np.maximum(start, end) - self.bound if self.upper else self.bound - np.minimum(start, end)
+        return np.fmax(start, end) - self.bound if self.upper else self.bound - np.fmin(start, end)
 
     def metrics(self, episode: Episode, samples: int = 1) -> dict[str, float]:
         """Worst excess (signed) and its integral over time, in mV and mV s or K and K s.
@@ -88,10 +88,17 @@ class Limit:
 
 
 def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64]:
-    """Centred mean of ``samples`` neighbours, fewer at the ends, shape unchanged."""
+    """Centred mean of ``samples`` neighbours, fewer at the ends, shape unchanged.
+
+    A value that is no finite number is a lost one: the mean is that of the others, and nan where all are lost.
+    """
     if samples == 1:
         return values
-    total, at = np.concatenate([[0.0], np.cumsum(values)]), np.arange(values.size)
+    known = np.isfinite(values)
+    total, count = (np.concatenate([[0.0], np.cumsum(v)]) for v in (np.where(known, values, 0.0), known))
+    at = np.arange(values.size)
     first = np.maximum(at - samples // 2, 0)
     beyond = np.minimum(at + (samples - 1) // 2 + 1, values.size)
-    return np.asarray((total[beyond] - total[first]) / (beyond - first), dtype=np.float64)
+    counted = count[beyond] - count[first]
+    mean = (total[beyond] - total[first]) / np.maximum(counted, 1.0)
+    return np.asarray(np.where(counted > 0, mean, np.nan), dtype=np.float64)

@@ -16,11 +16,12 @@ from chargetune.battery.config import CASE_STUDIES, Config, SafetyTable, TunerNa
 from chargetune.battery.twin import ChargingTwin
 from chargetune.battery.windows import ChargingWindows
 from chargetune.episode.episode import Episode
+from chargetune.study.result import read_result
 from chargetune.study.store import Store
 from chargetune.study.study import Proposer, Study
-from chargetune.study.trial import Trial, best_feasible, best_performance
+from chargetune.study.trial import Trial
 
-__all__ = ["ATTAINABLE_T95_MIN", "make_tuner", "open_study", "reproduce", "seed_row", "seed_run", "summarise", "tuned_trial"]
+__all__ = ["ATTAINABLE_T95_MIN", "make_tuner", "open_study", "reproduce", "seed_row", "seed_run", "summarise"]
 
 # t95 in minutes that 4000 evaluations of CMA-ES reach on seeds 0-7 with U1 propagated by the controller's own model,
 # overshoot at most 0.3 mV (backoff of seed 0: 2.3 mV). For "both" none is known.
@@ -96,23 +97,6 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
     )
 
 
-def tuned_trial(trials: Sequence[Trial], tuner: str) -> Trial | None:
-    """The result of a study: the best trial that kept every limit, or the one that came closest to it when none did.
-
-    For the paper's method it is the best performance G.
-    """
-    if tuner == "ei":
-        return best_performance(trials)
-    scored = [t for t in trials if t.score is not None]
-    return best_feasible(trials) or min(scored, key=_worst_excess, default=None)
-
-
-def _worst_excess(trial: Trial) -> float:
-    if trial.score is None:
-        return np.inf
-    return max((e - trial.score.tolerance.get(name, 0.0) for name, e in trial.score.excess.items()), default=0.0)
-
-
 def reproduce(
     case: str,
     seeds: Sequence[int],
@@ -152,7 +136,7 @@ def seed_run(store: Store, name: str, trials: int | None = None) -> SeedRun:
     """What the claims need of one stored study, from its first ``trials`` trials."""
     record = store.study(name)
     listed = tuple(store.trials(record.id)[:trials])
-    tuned = tuned_trial(listed, record.identity["config"]["study"]["tuner"])
+    tuned = read_result(store, record, listed).trial
 
     def episode(trial: Trial) -> Episode:
         trace = store.trace(record.id, trial.number)

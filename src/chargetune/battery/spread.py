@@ -13,9 +13,11 @@ from chargetune.battery.charging import ChargingProblem, NotMeasuredError
 from chargetune.battery.checks import check_number
 from chargetune.battery.ecm import ecm_model, start_state
 from chargetune.battery.electrochemical import Electrochemical
+from chargetune.control.mpc import compiled_act
 from chargetune.episode.compiled import compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
+from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
@@ -96,23 +98,27 @@ class Variations:
     def run(self, draw: Draw, theta: ArrayLike) -> tuple[Score | None, Episode]:
         """One charge on the drawn plant and the verdict on its true outputs; no score when it did not come to its end."""
         problem, factors, known = self.problem, draw.factors, self.problem.plant_model
-        own = replace(problem, soc_start=draw.soc_start, verdict_samples=1, abort_margin_V=None, abort_margin_K=None)
+        # What the controller believes moves along, and is a SOC, however wrong it is.
+        believed = start_state(problem.plant_cell, min(max(draw.soc_start + problem.soc_start_error, 0.0), 1.0))
+        names = problem.controller.model.state_names
+        controller = replace(problem.controller, start=tuple(believed.get(name, 0.0) for name in names))
         if isinstance(known, Electrochemical):
             resistance = max(1.0, known.resistance_scale * factors["R0_ohm"])
             other = replace(known, resistance_scale=resistance, capacity_scale=known.capacity_scale * factors["capacity_Ah"])
-            episode = replace(own, plant_model=other).episode(theta, draw.seed)
+            drawn = other.plant(draw.soc_start, problem.sampling_time_s, problem.sensors)
+            control = compiled_act(controller)
+            episode = run_episode(controller, drawn, steps=problem.steps, theta=theta, seed=draw.seed, control=control)
         else:
             nominal = dict(self.model.parameters)
             scaled = {name: np.array(nominal[name]) * factor for name, factor in factors.items()}
-            start = start_state(problem.plant_cell, draw.soc_start)
-            plant = SimulatedPlant(self.model.with_parameters(**scaled), start, problem.sensors)
-            believed = start | {"soc": min(max(draw.soc_start + problem.soc_start_error, 0.0), 1.0)}
-            names = problem.controller.model.state_names
-            controller = replace(problem.controller, start=tuple(believed.get(name, 0.0) for name in names))
+            plant = SimulatedPlant(self.model.with_parameters(**scaled), start_state(problem.plant_cell, draw.soc_start), problem.sensors)
             episode = compiled_episode(controller, plant, problem.steps).run(theta, draw.seed)
         if episode.ending is not Ending.DONE:
             return None, episode
+        # Judged is the problem as it stands: one that began at the drawn SOC may be a problem that nobody may state, a cell at rest
+        # above its limit for one, and is an episode all the same.
+        judge = replace(problem, sensors=Sensors(), verdict_samples=1)
         try:
-            return replace(own, sensors=Sensors()).score(episode.noise_free()), episode
+            return judge.score(episode.noise_free(), soc_start=draw.soc_start), episode
         except NotMeasuredError:
             return None, episode

@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import traceback
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -26,6 +27,8 @@ app = typer.Typer(
 store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
 INTERRUPTED = 130
+# EX_SOFTWARE of sysexits.h.
+DEFECT = 70
 
 
 class ExportFormat(StrEnum):
@@ -238,7 +241,7 @@ def compare(
 def certify(
     store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of the study; needed when the store holds several.")] = None,
-    trial: Annotated[int | None, typer.Option(min=0, help="Its theta is run; else that of the best trial that kept every limit.")] = None,
+    trial: Annotated[int | None, typer.Option(min=0, help="Its theta is run; else that of the result of the study.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 0,
     confidence: Annotated[float, typer.Option(help="Confidence of the bound on the violation probability.")] = 0.95,
@@ -339,7 +342,11 @@ def _options(
 
 
 def main() -> None:
-    """Run the command line; an error a person can mend is one message and exit code 2."""
+    """Run the command line. An error a person can mend is one message and exit code 2, a defect of the program exit code 70.
+
+    Refused input is a plain ValueError. What is derived from it is some library's (LinAlgError, UnicodeError, JSONDecodeError): where
+    it comes from a user's file, who reads the file says so in a ValueError that names it. So it is a defect, and shows its traceback.
+    """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -350,20 +357,25 @@ def main() -> None:
         if ended.code == INTERRUPTED:
             typer.echo("interrupted; the same command resumes", err=True)
         raise
-    except (ValueError, OSError) as error:
-        _refuse(error)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
+        if type(error) is ValueError or isinstance(error, OSError):
+            _refuse(error)
         # Import only now: these modules are heavy, and are loaded already when one of them raised.
+        from pydantic import ValidationError
+
         from chargetune.study.identity import StudyError
         from chargetune.study.records import StoreError
         from chargetune.study.runner import WorkerError
 
-        if not isinstance(error, (StudyError, StoreError, WorkerError)):
-            raise
-        _refuse(error)
+        if isinstance(error, (ValidationError, StudyError, StoreError, WorkerError)):
+            _refuse(error)
+        traceback.print_exc()
+        what = f"{type(error).__name__}: {error}"
+        typer.echo(f"chargetune: a defect of this program ({what}); please report it with the lines above", err=True)
+        sys.exit(DEFECT)
 
 
-def _refuse(error: BaseException) -> None:
+def _refuse(error: BaseException) -> NoReturn:
     text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
     typer.echo(f"chargetune: {text}", err=True)
     sys.exit(2)

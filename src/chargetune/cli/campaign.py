@@ -120,5 +120,6 @@ def _facts(entry: Entry, row: Standing) -> dict[str, Any]:
         "best": None
         if row.best is None or score is None
         else {"trial": row.best.number, "feasible": score.feasible, "objective": score.objective, "metrics": dict(score.metrics)},
+        "result": row.result.facts(),
         "theta": None if row.best is None else list(row.best.theta),
     }

@@ -16,8 +16,8 @@ from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
 from chargetune.study.database import store_name
 from chargetune.study.executors import process_executor
+from chargetune.study.result import read_result
 from chargetune.study.store import Store
-from chargetune.study.trial import best_feasible
 
 __all__ = ["certify_command"]
 
@@ -35,7 +35,7 @@ def certify_command(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Run the theta of a trial, or the best that kept every limit, on fresh episodes and write the certificate."""
+    """Run the theta of a trial, or of the study's result, on fresh episodes and write the certificate."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
     with Store(location, read_only=True) as store:
@@ -44,12 +44,18 @@ def certify_command(
             raise ValueError(f"{store.label} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
         record = store.study(study or names[0])
         trials = store.trials(record.id)
-    best = best_feasible(trials) if trial is None else next((t for t in trials if t.number == trial), None)
+        result = read_result(store, record, trials)
+    best = result.kept if trial is None else next((t for t in trials if t.number == trial), None)
     if best is None and trial is not None:
         allowed = f"0 to {len(trials) - 1}" if trials else "none: it has no trials"
         raise ValueError(f"--trial {trial}: study {record.name!r} has no such trial, allowed is {allowed}")
+    if best is None and result.trial is not None:
+        raise ValueError(
+            f"{store.label}: the result of study {record.name!r}, trial {result.trial.number}, broke a limit ({result.sentence}),"
+            " so there is nothing to certify; --trial N certifies another one"
+        )
     if best is None:
-        raise ValueError(f"{store.label}: study {record.name!r} has no trial that kept every limit, so there is nothing to certify")
+        raise ValueError(f"{store.label}: study {record.name!r} has no trial with a score, so there is nothing to certify")
     if "cell" not in record.identity["config"]:
         raise ValueError(f"{store.label}: study {record.name!r} is not one of battery charging")
     problem = problem_of_document(record.identity["config"])
@@ -77,6 +83,7 @@ def certify_command(
             "study_sha256": record.identity_sha256,
             "trial": best.number,
             "trials": len(trials),
+            "why": f"it is the result: {result.sentence}" if trial is None else "it was named",
         },
         spread=spread,
         seed=seed,
@@ -91,7 +98,7 @@ def certify_command(
         return
     screen = console()
     _print(certificate)
-    screen.print(f"certificate {target}\ntraces {target.with_suffix('.npz')}\nfigure {figure}", soft_wrap=True)
+    screen.print(f"certificate {target}\ntraces {target.with_name(certificate['traces']['file'])}\nfigure {figure}", soft_wrap=True)
     screen.print(f"[dim]recompute every figure from the traces: chargetune verify {target}[/]", soft_wrap=True)
 
 
@@ -103,6 +110,7 @@ def _print(certificate: dict[str, Any]) -> None:
         f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
         soft_wrap=True,
     )
+    screen.print(f"[dim]trial {origin['trial']}: {origin['why']}[/]", soft_wrap=True)
     if certificate["cell"]["remark"]:
         screen.print(f"[dim]{certificate['cell']['remark']}[/]")
     bound, confidence = f["violation_probability_upper"], certificate["confidence"]

@@ -9,13 +9,14 @@ from typing import Any
 
 from rich.table import Table
 
-from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.compare import Row, compare, row_names
 from chargetune.battery.config import load_config
-from chargetune.cli.output import console, number, shown
+from chargetune.cli.output import console, number, result_line, shown
 from chargetune.cli.tune import bar
 from chargetune.report.style import check_format
 from chargetune.study.executors import process_executor
+from chargetune.study.result import StudyResult, read_result
+from chargetune.study.store import Store
 
 __all__ = ["compare_command"]
 
@@ -28,7 +29,8 @@ def compare_command(
         check_format(figure)
     config = load_config(path)
     problem = config.problem(path.parent)
-    theta = None if store is None else _tuned(store, study or config.study.name, problem)
+    result = None if store is None else _result(store, study or config.study.name)
+    theta = None if result is None or result.trial is None else problem.space.validate(result.trial.theta).tolist()
     names = row_names(problem, theta)
     found: dict[str, Row] = {}
     with ExitStack() as stack:
@@ -45,7 +47,7 @@ def compare_command(
 
         save(comparison_figure(problem, rows), figure)
     if as_json:
-        print(json.dumps({"rows": [_facts(row) for row in rows]}))  # noqa: T201
+        print(json.dumps({"rows": [_facts(row) for row in rows], "result": None if result is None else result.facts()}))  # noqa: T201
         return
     screen = console()
     screen.print(_table(rows))
@@ -54,19 +56,20 @@ def compare_command(
         "highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
         "and is what can be reached.[/]"
     )
+    if result is not None:
+        screen.print(f"[dim]Tuned MPC: {result_line(result)}[/]", soft_wrap=True)
     if store is None:
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:
         screen.print(f"figure {figure}")
 
 
-def _tuned(store: str, study: str, problem: ChargingProblem) -> list[float]:
-    from chargetune.report.reading import read_study
-
-    view = read_study(store, study)
-    if view.tuned is None:
-        raise ValueError(f"{shown(store)}: study {study!r} has no trial with a score yet")
-    return [float(value) for value in problem.space.validate(view.tuned.theta)]
+def _result(location: str, study: str) -> StudyResult:
+    with Store(location, read_only=True) as store:
+        result = read_result(store, store.study(study))
+    if result.trial is None:
+        raise ValueError(f"{shown(location)}: study {study!r} has no trial with a score yet")
+    return result
 
 
 def _facts(row: Row) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from chargetune.battery.pulses import segments
 from chargetune.battery.record import Record
 from chargetune.cli.output import console
 from chargetune.report.style import check_format
+from chargetune.study.files import write_whole
 
 __all__ = ["identify_command"]
 
@@ -44,7 +45,7 @@ def identify_command(
     today = datetime.now().astimezone().date().isoformat()
     found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(cell_toml(found.cell, found.remarks), encoding="utf-8")
+    write_whole(out, cell_toml(found.cell, found.remarks))
     # What was written is what a controller will read.
     cell = load_cell(out)
     if figure is not None:

@@ -12,10 +12,11 @@ from rich.table import Table
 from chargetune.battery.charging import ChargingProblem
 from chargetune.episode.score import Score
 from chargetune.study.database import database_at
+from chargetune.study.result import StudyResult
 from chargetune.study.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["beside", "console", "metrics_table", "shown", "theta_lines", "trials_table"]
+__all__ = ["beside", "console", "metrics_table", "result_line", "shown", "theta_lines", "trials_table"]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -52,6 +53,12 @@ def shown(location: str) -> str:
 def number(value: float | None, digits: int = 2) -> str:
     """A figure, or a dash where the episode never got there."""
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def result_line(result: StudyResult) -> str:
+    """Which trial is the result of a study, and why."""
+    which = "no result" if result.trial is None else f"the result is trial {result.trial.number}"
+    return f"{which}: {result.sentence}"
 
 
 def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) -> Table:

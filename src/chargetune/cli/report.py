@@ -10,6 +10,7 @@ from chargetune.cli.tune import bar
 from chargetune.report import read_study, save_figures
 from chargetune.report.page import report_page
 from chargetune.report.reading import read_studies
+from chargetune.study.files import write_whole
 
 __all__ = ["report_command"]
 
@@ -27,7 +28,7 @@ def report_command(location: str, *, study: str | None, out: Path | None, figure
     view = read_study(location, study)
     with bar(quiet=as_json) as progress:
         task = progress.add_task("sensitivities", total=view.space.dimension, note="")
-        target.write_text(report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task)), encoding="utf-8")
+        write_whole(target, report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task)))
         progress.remove_task(task)
     drawn = save_figures(location, study, figures, ("pdf",)) if figures is not None else []
     if as_json:

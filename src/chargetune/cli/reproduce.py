@@ -13,6 +13,7 @@ from chargetune.battery.reproduce import reproduce, summarise
 from chargetune.cli.output import console, number
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor
+from chargetune.study.files import write_whole
 
 __all__ = ["reproduce_command", "seed_list"]
 
@@ -52,7 +53,7 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
         rows = reproduce(case, numbers, trials=trials, tuner=name, path=path, executor=executor, progress=note)
     result = summarise(out, case, name, rows, trials)
     for target in (out / "claims.json", out / f"claims-{case}-{tuner}.json"):
-        target.write_text(json.dumps(result, indent=1))
+        write_whole(target, json.dumps(result, indent=1))
     figures = save_figures(path, case_study(case, numbers[0], name).study.name, out / f"{case}-{tuner}-seed{numbers[0]}", trials=trials)
     seeds_figure(rows, out / f"{case}-{tuner}-seeds.png")
     if as_json:

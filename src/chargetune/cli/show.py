@@ -7,9 +7,10 @@ from typing import Any
 
 from rich.table import Table
 
-from chargetune.cli.output import console, number, trials_table
+from chargetune.cli.output import console, number, result_line, trials_table
+from chargetune.study.result import StudyResult, read_result
 from chargetune.study.store import Store, StudyRecord
-from chargetune.study.trial import Trial, TrialStatus, best_feasible
+from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["show_command"]
 
@@ -20,20 +21,22 @@ def show_command(location: str, *, study: str | None, as_json: bool) -> None:
         if study is not None:
             record = store.study(study)
             trials = store.trials(record.id)
+            result = read_result(store, record, trials)
             if as_json:
-                print(json.dumps({**_summary(record, trials), "trials": [_trial(t) for t in trials]}))  # noqa: T201
+                print(json.dumps({**_summary(record, trials, result), "trials": [_trial(t) for t in trials]}))  # noqa: T201
             else:
                 console().print(trials_table(trials))
+                console().print(result_line(result), soft_wrap=True)
             return
-        listed = [(record, store.trials(record.id)) for record in store.studies()]
+        listed = [(record, trials := store.trials(record.id), read_result(store, record, trials)) for record in store.studies()]
     if as_json:
-        print(json.dumps({"studies": [_summary(*pair) for pair in listed]}))  # noqa: T201
+        print(json.dumps({"studies": [_summary(*one) for one in listed]}))  # noqa: T201
         return
     table = Table(box=None, pad_edge=False)
     for heading in ("study", "trials", "failed", "violating", "best t95 min", "best trial", "created"):
         table.add_column(heading, justify="left" if heading in ("study", "created") else "right")
-    for record, trials in listed:
-        s = _summary(record, trials)
+    for record, trials, result in listed:
+        s = _summary(record, trials, result)
         best = s["best"]
         table.add_row(
             record.name, str(s["done"]), str(s["failed"]), str(s["violating"]),
@@ -43,8 +46,8 @@ def show_command(location: str, *, study: str | None, as_json: bool) -> None:
     console().print("[dim]one study's trials: chargetune show STORE --study NAME[/]")
 
 
-def _summary(record: StudyRecord, trials: list[Trial]) -> dict[str, Any]:
-    best = best_feasible(trials)
+def _summary(record: StudyRecord, trials: list[Trial], result: StudyResult) -> dict[str, Any]:
+    best = result.kept
     return {
         "name": record.name,
         "created_at": record.created_at,
@@ -53,6 +56,7 @@ def _summary(record: StudyRecord, trials: list[Trial]) -> dict[str, Any]:
         "running": sum(t.status is TrialStatus.RUNNING for t in trials),
         "violating": sum(t.score is not None and not t.score.feasible for t in trials),
         "best": _trial(best) if best else None,
+        "result": result.facts(),
     }
 
 

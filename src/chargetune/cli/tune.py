@@ -19,14 +19,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.charging_check import check_charging
 from chargetune.battery.config import Config, load_config
-from chargetune.battery.reproduce import open_study, tuned_trial
+from chargetune.battery.reproduce import open_study
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, metrics_table, number, shown, theta_lines
+from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
 from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
+from chargetune.study.files import write_whole
+from chargetune.study.result import StudyResult, read_result
 from chargetune.study.store import Store
 from chargetune.study.study import Study
-from chargetune.study.trial import Trial, TrialStatus, best_feasible
+from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["bar", "tune_command"]
 
@@ -69,22 +71,21 @@ def tune_command(
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
     _check(problem, config.safe_start(problem), force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
-    everything, believed, safety = _run(opening, problem, count, workers, quiet=as_json)
-    best = believed or tuned_trial(everything, config.study.tuner)
+    everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
 
-        figures = save_figures(kept, config.study.name, out, trials=count, result=best.number if best else None)
-    summary = _summary(config, everything, best, problem.space.entries)
+        figures = save_figures(kept, config.study.name, out, trials=count)
+    summary = _summary(config, everything, result, problem.space.entries)
     summary |= {"safety": safety} if safety else {}
     if out is not None:
-        (out / "summary.json").write_text(json.dumps(summary, indent=1))
+        write_whole(out / "summary.json", json.dumps(summary, indent=1))
     if as_json:
         print(json.dumps(summary))  # noqa: T201
         _end(safety)
         return
-    _closing(problem, everything, best)
+    _closing(problem, everything, result)
     if safety:
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
@@ -105,8 +106,8 @@ class Opening:
 
 def _run(
     opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool
-) -> tuple[list[Trial], Trial | None, dict[str, Any] | None]:
-    """The trials of the study, the one that its tuner believes best, and what there is to say of safety."""
+) -> tuple[list[Trial], StudyResult, dict[str, Any] | None]:
+    """The trials of the study, its result, and what there is to say of safety."""
     config, kept = opening.config, opening.kept
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
@@ -143,8 +144,10 @@ def _run(
             stopped = str(error)
         everything = study.trials()[:count]
         safety = _safety(config, problem, study, everything, stopped)
-        believed = study.believed_best(count)
-    return everything, believed, safety
+        # After a study that stopped, too.
+        study.result()
+        result = read_result(store, study.record, everything)
+    return everything, result, safety
 
 
 @contextmanager
@@ -190,8 +193,8 @@ def _check(problem: ChargingProblem, start: NDArray[np.float64] | None, *, force
         raise ValueError("the formulation has an error; `chargetune check` shows it, --force tunes nevertheless")
 
 
-def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | None) -> None:
-    screen = console()
+def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyResult) -> None:
+    screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
     screen.print(f"\n[bold]{problem.plant_cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
@@ -205,16 +208,13 @@ def _closing(problem: ChargingProblem, everything: list[Trial], best: Trial | No
         screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
     if best is not None:
         units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
-        measured = best_feasible(everything)
-        if measured is not None and measured.number != best.number:
-            screen.print(
-                f"[dim]Trial {best.number} is the best one by all traces together, trial {measured.number} by its own noisy verdict. "
-                f"To certify the former: chargetune certify ... --trial {best.number}[/]"
-            )
+        screen.print(result_line(result), soft_wrap=True)
         screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 
-def _summary(config: Config, trials: list[Trial], best: Trial | None, names: tuple[str, ...]) -> dict[str, Any]:
+def _summary(config: Config, trials: list[Trial], result: StudyResult, names: tuple[str, ...]) -> dict[str, Any]:
+    best = result.trial
+
     def facts(trial: Trial | None) -> dict[str, Any] | None:
         if trial is None or trial.score is None:
             return None
@@ -235,5 +235,6 @@ def _summary(config: Config, trials: list[Trial], best: Trial | None, names: tup
         "failed": sum(t.status is TrialStatus.FAILED for t in trials),
         "untuned": facts(trials[0]) if trials else None,
         "tuned": facts(best),
+        "result": result.facts(),
         "theta": dict(zip(names, best.theta, strict=True)) if best else None,
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -142,7 +141,12 @@ def check_horizon(
     transition = ca.Function("A", [x, u, p], [ca.jacobian(model.f(x, u, p), x)])
     step, points, fastest = model.sampling_time_s, _points(len(inputs)), []
     for k in points:
-        eigenvalues = np.linalg.eigvals(_finite(transition(states[k], inputs[k], model.nominal))).astype(complex)
+        slopes = np.array(transition(states[k], inputs[k], model.nominal))
+        # Outside of the model's domain nothing is known of its time constants.
+        if not np.all(np.isfinite(slopes)):
+            fastest.append(np.nan)
+            continue
+        eigenvalues = np.linalg.eigvals(slopes).astype(complex)
         sizes = np.abs(np.log(np.where(eigenvalues == 0, 1e-12, eigenvalues)))
         slow = sizes[(sizes > INTEGRATES) & (sizes < OVER)]
         fastest.append(step / np.max(slow) if slow.size else np.nan)
@@ -173,7 +177,3 @@ def check_horizon(
 
 def _points(count: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, POINTS)).astype(np.int64))
-
-
-def _finite(matrix: Any) -> NDArray[np.float64]:
-    return np.asarray(np.nan_to_num(np.array(matrix, dtype=float)), dtype=np.float64)

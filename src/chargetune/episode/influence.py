@@ -68,7 +68,8 @@ def check_influence(inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def check_theta(worst: Callable[[NDArray[np.float64]], float], space: ParameterSpace, start: ArrayLike | None = None) -> list[Finding]:
     """Whether some theta at least halves what is beyond the limits, and whether the one declared safe keeps them.
 
-    ``worst(theta)`` is the largest excess over any limit less its tolerance, positive when one is broken. Tried are
+    ``worst(theta)`` is the largest excess over any limit less its tolerance, in tolerances (`Score.worst`), positive when one is
+    broken. Tried are
     theta_0, each parameter and all of them at either bound, and random theta.
     """
     if start is not None:
@@ -79,7 +80,7 @@ def check_theta(worst: Callable[[NDArray[np.float64]], float], space: ParameterS
             Finding(
                 "unsafe-start",
                 "error",
-                f"the theta declared safe breaks a limit in simulation, by {excess:.4g} beyond its tolerance",
+                f"the theta declared safe breaks a limit in simulation, by {excess:.4g} tolerances more than its tolerance",
                 "declare a more cautious theta (a larger backoff, larger resistances), and check it again",
                 {"excess": excess},
             )
@@ -101,12 +102,13 @@ def check_theta(worst: Callable[[NDArray[np.float64]], float], space: ParameterS
         Finding(
             "no-safe-theta",
             "warning",
-            f"none of {len(tried)} theta keeps every limit or halves the excess: the least is {least:.4g}, untuned {excess_of[0]:.4g}",
+            f"none of {len(tried)} theta keeps every limit or halves the excess: the least is {least:.4g} tolerances more than the "
+            f"tolerance, untuned {excess_of[0]:.4g}",
             "let theta have more power over the limits: a backoff, a parameter that reaches the limited output, wider bounds",
             {"tried": float(len(tried)), "least_excess": least, "untuned_excess": float(excess_of[0])},
             Evidence(
                 "theta tried",
-                "excess beyond tolerance",
+                "excess beyond tolerance (tolerances)",
                 {"excess": (np.arange(len(tried), dtype=np.float64), np.array(excess_of))},
                 {"limit": 0.0},
             ),

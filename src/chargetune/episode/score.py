@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from chargetune.episode.notebook import facts, table
 
-__all__ = ["Score"]
+__all__ = ["Score", "in_tolerances"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,16 @@ class Score:
     profile: Mapping[str, tuple[float | None, ...]] = field(default_factory=dict)
 
     @property
+    def beyond(self) -> dict[str, float]:
+        """Of each limit the excess less its tolerance, in tolerances, so that limits of different units can be compared."""
+        return {name: float(in_tolerances(value, self.tolerance.get(name, 0.0))) for name, value in self.excess.items()}
+
+    @property
+    def worst(self) -> float:
+        """The largest of `beyond`: more than 0 when a limit is broken; -inf where there is no limit."""
+        return max(self.beyond.values(), default=-math.inf)
+
+    @property
     def feasible(self) -> bool:
         """Whether every limit was kept within its tolerance."""
         return all(value <= self.tolerance.get(name, 0.0) for name, value in self.excess.items())
@@ -46,3 +60,8 @@ class Score:
         limits = [(n, e, self.tolerance.get(n, 0.0), e <= self.tolerance.get(n, 0.0)) for n, e in self.excess.items()]
         head = facts("Score", {"limits kept": self.feasible, "objective": self.objective, "performance": self.performance, **self.metrics})
         return head + (table(("limit", "worst excess", "tolerance", "kept"), limits) if limits else "")
+
+
+def in_tolerances(excess: ArrayLike, tolerance: float, share: float = 1.0) -> NDArray[np.float64]:
+    """(excess - share tolerance) / tolerance, any shape; a limit without tolerance counts in its own unit."""
+    return np.asarray((np.asarray(excess, dtype=float) - share * tolerance) / (tolerance or 1.0), dtype=np.float64)

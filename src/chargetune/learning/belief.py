@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from chargetune.episode.cores import meanwhile
 from chargetune.episode.episode import Episode
-from chargetune.episode.score import Score
+from chargetune.episode.score import Score, in_tolerances
 from chargetune.learning.discrepancy import SCALES, Discrepancy, OutputError, scale_of
 from chargetune.learning.envelope import EnvelopeLoop
 from chargetune.learning.posterior import Posterior
@@ -232,7 +232,7 @@ def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:
     for name, worst in score.excess.items():
         tolerance = score.tolerance.get(name, 0.0)
         windows = score.profile.get(name, (worst,))
-        out += [np.nan if w is None else (w - share * tolerance) / (tolerance or 1.0) for w in windows]
+        out += [np.nan if w is None else float(in_tolerances(w, tolerance, share)) for w in windows]
     return np.array(out)
 
 
@@ -244,7 +244,7 @@ def samples_of(
     for name in score.excess:
         tolerance = score.tolerance.get(name, 0.0)
         excess, window = samples[name]
-        values.append((excess - share * tolerance) / (tolerance or 1.0))
+        values.append(in_tolerances(excess, tolerance, share))
         windows.append(window + first)
         first += len(score.profile.get(name, (0.0,)))
     return np.concatenate(values), np.concatenate(windows)

@@ -140,8 +140,7 @@ class _Models:
             incumbent = int(np.argmax(np.where(feasible, objective, -np.inf)))
             best = float(objective[incumbent])
         else:
-            worst = [max((e - s.tolerance.get(name, 0.0) for name, e in s.excess.items()), default=0.0) for s in scores]
-            incumbent, best = int(np.argmin(worst)), None
+            incumbent, best = int(np.argmin([s.worst for s in scores])), None
         return cls(ModelListGP(*fitted), tuple(limit.bound for limit in limits), incumbent, best)
 
     def acquisition(self, waiting: torch.Tensor, seed: int) -> AcquisitionFunction:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.score import Score
 from chargetune.report.reading import StudyView
 from chargetune.report.style import BLUE, COLUMN_IN, GREEN, ORANGE, RED, journal_style, legend_above, letter, new_figure, plain_symlog
 from chargetune.study.trial import Trial, TrialStatus
@@ -28,9 +29,11 @@ def loss(view: StudyView, trial: Trial) -> float:
     return -(trial.score.performance if view.tuner == "ei" else trial.score.objective)
 
 
-def worst_excess(trial: Trial) -> float:
-    """The largest excess over all limits, in their own unit; NaN without a score."""
-    return np.nan if trial.score is None else max(trial.score.excess.values(), default=np.nan)
+def worst_excess(view: StudyView, score: Score | None) -> float:
+    """The largest excess over all limits, in what `excess_unit` is a factor to; NaN without a score or a limit."""
+    if score is None or not score.excess:
+        return np.nan
+    return max(score.excess.values()) if _alike(view) else score.worst
 
 
 def incumbents(view: StudyView) -> NDArray[np.float64]:
@@ -54,7 +57,7 @@ def convergence_figure(view: StudyView) -> Figure:
         for text, trials, style in marks:
             at = [t.number for t in trials]
             upper.plot(at, [loss(view, t) for t in trials], label=text, linestyle="none", **style)
-            lower.plot(at, [scale * worst_excess(t) for t in trials], label=text, linestyle="none", **style)
+            lower.plot(at, [scale * worst_excess(view, t.score) for t in trials], label=text, linestyle="none", **style)
         failed = [t.number for t in view.trials if t.status is TrialStatus.FAILED]
         if failed:
             # A failed trial has no value, so its mark stands at the foot of the axis.
@@ -69,7 +72,7 @@ def convergence_figure(view: StudyView) -> Figure:
             handles += upper.plot(numbers, best, color=ORANGE, drawstyle="steps-post", label="best so far", zorder=2)
         handles.append(lower.axhline(0.0, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, label="limit"))
         allowed = {v for t in view.trials if t.score is not None for v in t.score.tolerance.values()}
-        if len(allowed) == 1 and allowed != {0.0}:
+        if _alike(view) and len(allowed) == 1 and allowed != {0.0}:
             handles.append(lower.axhline(scale * allowed.pop(), color=RED, linestyle=":", linewidth=0.8, label="tolerance"))
         low, high = lower.get_ylim()
         lower.set_ylim(min(-1.0, low), max(1.0, high))
@@ -119,8 +122,24 @@ def loss_label(view: StudyView) -> str:
 
 
 def excess_unit(view: StudyView) -> tuple[str, float]:
-    """Unit of the lower panel and the factor to it: millivolts when every limit is a voltage."""
-    limits = {name for t in view.trials if t.score is not None for name in t.score.excess}
+    """Unit of the worst excess and the factor to it: millivolts when every limit is a voltage, with the same tolerance.
+
+    The unit of the limit where there is one. Else limits are compared as `Score.worst` does, in tolerances beyond the tolerance.
+    """
+    limits = _limits(view)
+    if not _alike(view):
+        return "tolerances, kept below 0", 1.0
     if (limits or view.problem is not None) and all(name.endswith("_V") for name in limits):
         return "mV", 1e3
     return "unit of the limit", 1.0
+
+
+def _limits(view: StudyView) -> set[str]:
+    return {name for t in view.trials if t.score is not None for name in t.score.excess}
+
+
+def _alike(view: StudyView) -> bool:
+    """Whether excesses of all limits may be compared as they are: one limit, or voltages of one tolerance."""
+    limits = _limits(view)
+    allowed = {t.score.tolerance.get(name, 0.0) for t in view.trials if t.score is not None for name in t.score.excess}
+    return len(limits) <= 1 or (len(allowed) == 1 and all(name.endswith("_V") for name in limits))

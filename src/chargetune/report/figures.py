@@ -42,11 +42,8 @@ def save_figures(
     formats: Sequence[str] = ("png",),
     *,
     trials: int | None = None,
-    result: int | None = None,
 ) -> list[Path]:
     """Draw the study ``name`` (its first ``trials`` trials) from its store into ``folder``, which is made; gives the files written.
-
-    ``result`` is the number of the trial that is drawn as the tuned one, else the best that was measured to keep the limits is.
 
     Formats are "png" (300 dpi), "pdf" and "svg" (vectors, at the width of a journal's column or page).
     Raises StoreError for a file that is no store and for an unknown study, ValueError for an unknown format or trial, or no trials.
@@ -54,7 +51,7 @@ def save_figures(
     unknown = [f for f in formats if f not in FORMATS]
     if unknown or not formats or isinstance(formats, str):
         raise ValueError(f"formats = {formats!r}, allowed is a non-empty selection of {', '.join(FORMATS)}")
-    view = read_study(store, name, trials=trials, result=result)
+    view = read_study(store, name, trials=trials)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     return [save(figure, target / f"{stem}.{kind}") for stem, figure in figures_of(view).items() for kind in formats]

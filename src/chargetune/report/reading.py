@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from chargetune.battery.charging import ChargingProblem
 from chargetune.battery.config import problem_of_document
-from chargetune.battery.reproduce import tuned_trial
 from chargetune.episode.episode import Episode
 from chargetune.model.parameters import ParameterSpace
 from chargetune.study.document import space_from_json
+from chargetune.study.result import StudyResult, read_result
 from chargetune.study.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -36,8 +36,7 @@ class StudyView:
     ``problem`` is None when the study is not one of battery charging.
 
     ``tuner`` is the tuner's name in the configuration, empty when that names none. ``record`` is what the store says of the
-    study as a whole, None only for trials that come from no store. ``result`` is the number of the trial that is the study's
-    result where its tuner named one, which the store does not know.
+    study as a whole, None only for trials that come from no store. ``result`` is the study's result as the store has it.
     """
 
     location: str
@@ -46,8 +45,8 @@ class StudyView:
     space: ParameterSpace
     trials: tuple[Trial, ...]
     problem: ChargingProblem | None
+    result: StudyResult
     record: StudyRecord | None = None
-    result: int | None = None
 
     @property
     def untuned(self) -> Trial | None:
@@ -57,9 +56,8 @@ class StudyView:
 
     @property
     def tuned(self) -> Trial | None:
-        """The study's result, the one named or what `tuned_trial` decides; it need not have kept the limits. None without a score."""
-        named = (t for t in self.trials if t.number == self.result)
-        return next(named, None) or tuned_trial(self.trials, self.tuner)
+        """The trial that is the study's result; it need not have kept the limits. None without a score."""
+        return self.result.trial
 
     @property
     def tuned_label(self) -> str:
@@ -111,20 +109,17 @@ class StudyView:
         return None if trial is None else next((episode for _, episode in self.episodes([trial])), None)
 
 
-def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None, result: int | None = None) -> StudyView:
-    """Read a study, or its first ``trials`` trials, without writing to the store; ``result`` names the trial that is its result.
+def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
+    """Read a study, or its first ``trials`` trials, without writing to the store.
 
-    Raises StoreError for what is no store and for an unknown study, naming those that there are; ValueError for a study
-    without trials, or without this one.
+    Raises StoreError for what is no store and for an unknown study, naming those that there are; ValueError for a study without trials.
     """
     with Store(store, read_only=True) as opened:
         record = opened.study(name)
-        found = opened.trials(record.id)[:trials]
-    if not found:
+        view = _view(opened, record, opened.trials(record.id)[:trials])
+    if not view.trials:
         raise ValueError(f"{opened.label}: study {name!r} has no trials yet, so there is nothing to draw")
-    if result is not None and result not in {t.number for t in found}:
-        raise ValueError(f"{opened.label}: result = {result}, allowed is the number of a trial of study {name!r}, 0 to {len(found) - 1}")
-    return replace(_view(opened.location, record, found), result=result)
+    return view
 
 
 def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
@@ -133,17 +128,18 @@ def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list
     Raises StoreError for what is no store.
     """
     with Store(store, read_only=True) as opened:
-        return [_view(opened.location, r, opened.trials(r.id)) for r in opened.studies() if only is None or r.id == only]
+        return [_view(opened, r, opened.trials(r.id)) for r in opened.studies() if only is None or r.id == only]
 
 
-def _view(location: str, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
+def _view(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
     config = record.identity["config"]
     return StudyView(
-        location=location,
+        location=store.location,
         name=record.name,
         tuner=str(config.get("study", {}).get("tuner", "")),
         space=space_from_json(record.identity["space"]),
         trials=tuple(trials),
         problem=problem_of_document(config) if "cell" in config else None,
+        result=read_result(store, record, trials),
         record=record,
     )

@@ -82,19 +82,22 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
 
 
 def _worst(episode: Episode, signal: str, samples: int, *, upper: bool, true: bool) -> tuple[float, float]:
-    """The extreme value of a signal and its time in seconds."""
-    best, when = (-np.inf, 0.0) if upper else (np.inf, 0.0)
+    """The extreme value of a signal among those measured, and its time in seconds; nan where none was."""
+    best, when = np.nan, 0.0
     for shift, values in zip((0.0, episode.sampling_time_s), episode.signal(signal, true=true), strict=True):
         smooth = _means(values, samples)
-        k = int(np.argmax(smooth) if upper else np.argmin(smooth))
-        if (smooth[k] > best) if upper else (smooth[k] < best):
+        if np.all(np.isnan(smooth)):
+            continue
+        k = int(np.nanargmax(smooth) if upper else np.nanargmin(smooth))
+        if np.isnan(best) or ((smooth[k] > best) if upper else (smooth[k] < best)):
             best, when = float(smooth[k]), float(episode.time_s[k] + shift)
     return best, when
 
 
 def _means(values: NDArray[np.float64], samples: int) -> NDArray[np.float64]:
-    """Centred means, summed anew for each place: slower than a running sum, and with none of its rounding."""
+    """Centred means of what was measured, summed anew for each place: slower than a running sum, and with none of its rounding."""
     if samples == 1:
         return values
     before, after = samples // 2, (samples - 1) // 2
-    return np.array([np.mean(values[max(0, k - before) : k + after + 1]) for k in range(len(values))])
+    parts = [values[max(0, k - before) : k + after + 1] for k in range(len(values))]
+    return np.array([np.mean(part[np.isfinite(part)]) if np.isfinite(part).any() else np.nan for part in parts])

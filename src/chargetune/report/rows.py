@@ -33,7 +33,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "remark": "" if problem is None else problem.plant_cell.remark,
         "loss_label": loss_label(view),
         "excess_unit": unit,
-        "tolerance": scale * allowed.pop() if len(allowed) == 1 else None,
+        "tolerance": scale * allowed.pop() if len(allowed) == 1 and unit in ("mV", "unit of the limit") else None,
         "limits": limits_of(view),
         "theta": [
             {"entry": entry, "unit": u, "lower": float(low), "upper": float(high), "untuned": float(start)}
@@ -71,7 +71,7 @@ def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]
             "feasible": None if trial.score is None else trial.feasible,
             "counted": trial.score is not None and (view.tuner == "ei" or trial.feasible),
             "loss": _finite(loss(view, trial)),
-            "excess": _finite(scale * worst_excess(trial)),
+            "excess": _finite(scale * worst_excess(view, trial.score)),
             "metrics": {} if trial.score is None else {name: _finite(v) for name, v in trial.score.metrics.items()},
             "asked_at": trial.asked_at,
             "told_at": trial.told_at or "",
@@ -94,6 +94,7 @@ def study_summary(view: StudyView) -> dict[str, Any]:
         "failed": sum(t.status is TrialStatus.FAILED for t in view.trials),
         "violating": sum(t.score is not None and not t.score.feasible for t in view.trials),
         "best": None if best is None or not best.feasible else best.number,
+        "result": view.result.facts(),
         "best_t95_min": None if best is None or best.score is None or not best.feasible else best.score.metrics.get("t95_min"),
         "told_at": max((t.told_at or "" for t in view.trials), default=""),
     }

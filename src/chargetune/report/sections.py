@@ -29,10 +29,10 @@ def opening(view: StudyView) -> str:
     if best is None:
         verdict = paragraph("No trial has a score: there is no result.", "bad")
     elif not best.feasible:
-        why = "it has the best performance G, which weighs violations" if view.tuner == "ei" else "no trial did, and it came closest"
-        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits: {why}.", "bad")
+        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits: {view.result.sentence}.", "bad")
     else:
-        verdict = paragraph(f"Result: trial {best.number}, which kept every limit. {_minutes(view)}", "good")
+        why = f"Why this one: {view.result.sentence}."
+        verdict = paragraph(f"Result: trial {best.number}, which kept every limit. {_minutes(view)} {why}", "good")
     note = '<p id="drawing">The figures are being drawn.</p>\n<noscript><p class="bad">The figures need JavaScript.</p></noscript>\n'
     return f"<header>\n<h1>{escape(view.name)}</h1>\n{paragraph(counts + more + '.', 'faint')}{verdict}{note}</header>\n<main>\n"
 

@@ -25,7 +25,7 @@ class Sensitivity:
     """What moving one entry of theta by `STEP` of its range does, down and up; None where the bound is nearer or no score came.
 
     ``minutes``: change of the time to 95 % SOC. ``objective``: change of the objective. ``excess``: change of the worst excess over
-    all limits, in their unit. Each is a pair (down, up).
+    all limits, as `worst_excess` compares them. Each is a pair (down, up).
     """
 
     entry: str
@@ -68,7 +68,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
             else:
                 after, before = score.metrics.get("t95_min"), base.metrics.get("t95_min")
                 minutes = None if after is None or before is None else after - before
-                excess = max(score.excess.values()) - max(base.excess.values())
+                excess = worst_excess(view, score) - worst_excess(view, base)
                 changes.append((minutes, score.objective - base.objective, excess))
         progress()
         down, up = changes
@@ -87,7 +87,7 @@ def rank_correlations(view: StudyView) -> dict[str, tuple[float, float]]:
         return {}
     thetas = np.array([t.theta for t in scored])
     objective = np.array([t.score.objective for t in scored if t.score is not None])
-    excess = np.array([worst_excess(t) for t in scored])
+    excess = np.array([worst_excess(view, t.score) for t in scored])
     out = {}
     for i, entry in enumerate(view.space.entries):
         if np.ptp(thetas[:, i]) and np.ptp(objective) and np.ptp(excess):

@@ -5,12 +5,15 @@ The object-oriented interface is used throughout, so that no window system, glob
 
 from __future__ import annotations
 
+import io
 import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from chargetune.study.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,5 +134,6 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
         figure.set_dpi(DPI)
         figure.canvas.draw()
         figure.set_layout_engine("none")
-        figure.savefig(target, format=kind, metadata=METADATA[kind])
-    return target
+        content = io.BytesIO()
+        figure.savefig(content, format=kind, metadata=METADATA[kind])
+    return write_whole(target, content.getvalue())

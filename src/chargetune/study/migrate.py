@@ -21,7 +21,7 @@ from chargetune.study.document import canonical_json, sha256
 from chargetune.study.provenance import made_by, utc_now
 from chargetune.study.trace import encode, expand, facts
 
-__all__ = ["migrate", "stored_version"]
+__all__ = ["from_2_to_3", "migrate", "stored_version"]
 
 
 def stored_version(connection: Connection) -> int | None:
@@ -44,7 +44,9 @@ def migrate(engine: Engine, path: Path) -> Path | None:
         if version == schema.SCHEMA_VERSION:
             return None
         copy = _back_up(path, version)
-        _from_1_to_2(connection)
+        if version == 1:
+            _from_1_to_2(connection)
+        from_2_to_3(connection)
         values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by()}
         connection.execute(insert(schema.store).values(values))
     return copy
@@ -68,6 +70,11 @@ def _back_up(path: Path, version: int | None) -> Path:
         break
     aside.unlink(missing_ok=True)
     return copy
+
+
+def from_2_to_3(connection: Connection) -> None:
+    """Make the table of results, empty: of an older study the result is what was measured, until its tuner is asked."""
+    schema.result.create(connection)
 
 
 def _from_1_to_2(connection: Connection) -> None:

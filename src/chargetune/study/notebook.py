@@ -8,7 +8,8 @@ from typing import Any
 
 from chargetune.episode.notebook import facts, table
 from chargetune.model.parameters import ParameterSpace
-from chargetune.study.trial import Trial, best_feasible
+from chargetune.study.result import StudyResult
+from chargetune.study.trial import Trial
 
 __all__ = ["study_html", "trials_dataframe"]
 
@@ -29,15 +30,16 @@ def trials_dataframe(space: ParameterSpace, trials: Sequence[Trial]) -> Any:
     return pd.DataFrame(rows, columns=columns or ["status"], index=pd.Index([t.number for t in trials], name="trial"))
 
 
-def study_html(name: str, about: Mapping[str, str], space: ParameterSpace, trials: Sequence[Trial]) -> str:
-    """How far a study is, and its best theta with units."""
-    best, count = best_feasible(trials), Counter(t.status.value for t in trials)
+def study_html(name: str, about: Mapping[str, str], space: ParameterSpace, trials: Sequence[Trial], result: StudyResult) -> str:
+    """How far a study is, its result where that kept the limits, and its theta with units."""
+    best, count = result.kept, Counter(t.status.value for t in trials)
     head = facts(
         f"Study {name}",
         {
             "trials": f"{len(trials)}: " + ", ".join(f"{n} {status}" for status, n in count.items()) if trials else "none",
             "broke a limit": sum(t.score is not None and not t.feasible for t in trials),
             "best trial": None if best is None else best.number,
+            "why": result.sentence,
             **about,
         },
     )

@@ -12,7 +12,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.pool import NullPool, QueuePool
 
 from chargetune.study import schema
-from chargetune.study.migrate import stored_version
+from chargetune.study.migrate import from_2_to_3, stored_version
 from chargetune.study.provenance import made_by, utc_now
 from chargetune.study.records import StoreError
 
@@ -23,6 +23,8 @@ SCHEMA = "chargetune"
 # Advisory locks of this program: (LOCKS, 0) while a transaction writes, (LOCKS, study id) while a process holds a study.
 LOCKS = 0x63747573
 CONNECT_S = 10
+# The schema to which this program's only adds a table, so that a server needs no copy of its data first.
+ADDED_TO = 2
 DISK_FULL = "53100"
 MEANINGS = {
     "55P03": "is locked by another session that did not let go in time",
@@ -51,7 +53,7 @@ class PostgresServer:
         return self.url.set(drivername="postgresql").render_as_string(hide_password=True)
 
     def prepare(self, *, read_only: bool, busy_timeout_s: float) -> None:
-        """Make the tables unless they are there. Raises StoreError for another schema version."""
+        """Make the tables unless they are there, and add the one that schema 2 lacks. Raises StoreError for another schema version."""
         engine = self.connect(read_only=read_only, busy_timeout_s=busy_timeout_s)
         try:
             with engine.connect() as connection:
@@ -63,6 +65,9 @@ class PostgresServer:
                     _create(connection)
             with engine.connect() as connection:
                 version = stored_version(connection)
+            if version == ADDED_TO and not read_only:
+                with engine.execution_options(writing=True).begin() as connection:
+                    version = _migrated(connection)
         except DBAPIError as error:
             raise StoreError(self.explain(error)) from error
         finally:
@@ -125,7 +130,9 @@ class PostgresServer:
             with engine.connect() as connection:
                 trials = select(func.count(), func.count(schema.trial.c.told_at), func.sum(schema.trial.c.attempt))
                 studies = select(schema.study.c.identity_sha256).order_by(schema.study.c.id)
-                return (tuple(connection.execute(trials).one()), tuple(connection.execute(studies).scalars())), True
+                results = select(schema.result.c.study_id, schema.result.c.made_from).order_by(schema.result.c.study_id)
+                counts, known = tuple(connection.execute(trials).one()), tuple(connection.execute(studies).scalars())
+                return (counts, known, tuple(map(tuple, connection.execute(results)))), True
         except DBAPIError as error:
             raise StoreError(self.explain(error)) from error
         finally:
@@ -203,6 +210,17 @@ def _create(connection: Connection) -> None:
     schema.metadata.create_all(connection)
     values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by()}
     connection.execute(insert(schema.store).values(values))
+
+
+def _migrated(connection: Connection) -> int | None:
+    version = stored_version(connection)
+    # Another process may have been first.
+    if version != ADDED_TO:
+        return version
+    from_2_to_3(connection)
+    values = {"schema_version": schema.SCHEMA_VERSION, "created_at": utc_now(), "created_by": made_by()}
+    connection.execute(insert(schema.store).values(values))
+    return schema.SCHEMA_VERSION
 
 
 def _lock(url: URL, study_id: int) -> Connection | None:

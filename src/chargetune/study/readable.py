@@ -44,11 +44,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Content:
-    """Studies and trials that are whole, as rows of their tables, and what is wrong with the others."""
+    """Studies, trials and results that are whole, as rows of their tables, and what is wrong with the others."""
 
     names: Mapping[int, str]
     studies: Mapping[int, Row[Any]]
     trials: Mapping[Key, Row[Any]]
+    results: Mapping[int, Row[Any]]
     findings: tuple[Finding, ...]
 
 
@@ -108,7 +109,12 @@ def read_content(database: Database, engine: Engine) -> Content:
         known = {f.trial for f in findings if f.study == names[study]}
         missing = sorted(set(range(min(numbers, default=0), max(numbers, default=-1) + 1)) - numbers - known - {None})
         findings += [Finding(names[study], number, "missing") for number in missing]
-    return Content(names, studies, trials, tuple(findings))
+    results: dict[int, Row[Any]] = {}
+    for row in _rows(database, engine, schema.result, findings):
+        # A result whose trial is lost is none, and the trial is among the findings.
+        if row.study_id in studies and (row.number is None or (row.study_id, row.number) in trials):
+            results[row.study_id] = row
+    return Content(names, studies, trials, results, tuple(findings))
 
 
 def read_traces(database: Database, engine: Engine, content: Content, step: Step | None = None) -> Iterator[tuple[Key, Row[Any] | Finding]]:

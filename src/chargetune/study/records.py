@@ -12,7 +12,7 @@ from sqlalchemy import Row
 from chargetune.study.document import canonical_json, score_from_json, score_to_json
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["StoreError", "StudyRecord", "record_of", "result_of", "trial_of", "trial_row"]
+__all__ = ["ResultRecord", "StoreError", "StudyRecord", "record_of", "result_of", "trial_of", "trial_row"]
 
 
 class StoreError(Exception):
@@ -34,6 +34,15 @@ class StudyRecord:
     versions: Mapping[str, str]
     hardware: bool = False
     trial_count: int = 0
+
+
+@dataclass(frozen=True)
+class ResultRecord:
+    """The number of the trial that is a study's result (None: none has a score), why, and the hash of what it was made from."""
+
+    number: int | None
+    reason: str
+    made_from: str
 
 
 def trial_row(trial: Trial) -> dict[str, Any]:

@@ -54,6 +54,8 @@ def salvage(source: str | os.PathLike[str], target: str | os.PathLike[str], step
                 ids[old] = connection.execute(select(schema.study.c.id).where(schema.study.c.name == study.name)).scalar_one()
             for (study_id, _), trial in sorted(content.trials.items()):
                 connection.execute(insert(schema.trial).values({**columns(trial), "study_id": ids[study_id]}))
+            for study_id, result in content.results.items():
+                connection.execute(insert(schema.result).values({**columns(result), "study_id": ids[study_id]}))
             for key, found in read_traces(database, engine, content, step):
                 if isinstance(found, Finding):
                     lost[key] = found

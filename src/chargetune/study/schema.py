@@ -17,10 +17,10 @@ from sqlalchemy import (
     Text,
 )
 
-__all__ = ["SCHEMA_VERSION", "holder", "metadata", "store", "study", "trace", "trial"]
+__all__ = ["SCHEMA_VERSION", "holder", "metadata", "result", "store", "study", "trace", "trial"]
 
-# 1: the first; 2: traces as zstd, attempts, terms of the holder, hardware
-SCHEMA_VERSION = 2
+# 1: the first; 2: traces as zstd, attempts, terms of the holder, hardware; 3: the result of a study
+SCHEMA_VERSION = 3
 
 metadata = MetaData()
 
@@ -88,4 +88,15 @@ holder = Table(
     Column("host", Text, nullable=False),
     Column("since", String(40), nullable=False),
     Column("term", Integer, nullable=False, server_default="0"),
+)
+
+# Which trial is the result, by the tuner that was asked. It holds for exactly the told trials of ``made_from``.
+result = Table(
+    "result",
+    metadata,
+    Column("study_id", ForeignKey("study.id"), primary_key=True, autoincrement=False),
+    Column("number", Integer),
+    Column("reason", String(16), nullable=False),
+    Column("made_from", String(64), nullable=False),
+    Column("made_at", String(40), nullable=False),
 )

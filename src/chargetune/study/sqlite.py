@@ -77,7 +77,9 @@ class SqliteFile:
             rows = connection.exec_driver_sql("PRAGMA integrity_check").scalars().all()
             return "" if rows == ["ok"] else "; ".join(str(row) for row in rows)
         # Traces are checked by their hash when read: going over all of them would take seconds at each start.
-        for table in (t.name for t in schema.metadata.sorted_tables if t is not schema.trace):
+        there = set(connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'").scalars())
+        # A store of an older schema lacks some.
+        for table in (t.name for t in schema.metadata.sorted_tables if t is not schema.trace and t.name in there):
             verdict = connection.exec_driver_sql(f"PRAGMA quick_check('{table}')").scalar()
             if verdict != "ok":
                 return str(verdict)

@@ -19,7 +19,7 @@ from chargetune.study import schema
 from chargetune.study.database import Hold, database_at
 from chargetune.study.document import canonical_json, sha256
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.records import StoreError, StudyRecord, record_of, result_of, trial_of, trial_row
+from chargetune.study.records import ResultRecord, StoreError, StudyRecord, record_of, result_of, trial_of, trial_row
 from chargetune.study.trace import content_sha256, decode, facts
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -263,6 +263,25 @@ class Store:
             return told
 
         return self.write(finish, study_id, term)
+
+    def result(self, study_id: int) -> ResultRecord | None:
+        """The result stored last, which may be of fewer trials than there are now: `read_result` knows. None where there is none."""
+        query = select(schema.result).where(schema.result.c.study_id == study_id)
+        row = self.read(lambda connection: connection.execute(query).first())
+        return None if row is None else ResultRecord(row.number, row.reason, row.made_from)
+
+    def set_result(self, study_id: int, result: ResultRecord, *, term: int | None = None) -> None:
+        """Record which trial is the result of a study, in place of what was recorded before."""
+        where = schema.result.c.study_id == study_id
+        values = {"number": result.number, "reason": result.reason, "made_from": result.made_from, "made_at": utc_now()}
+
+        def put(connection: Connection) -> None:
+            if connection.execute(select(schema.result).where(where)).first() is None:
+                connection.execute(insert(schema.result).values(study_id=study_id, **values))
+            else:
+                connection.execute(update(schema.result).where(where).values(values))
+
+        self.write(put, study_id, term)
 
     def count_loss(self, study_id: int, number: int, by: int = 1, *, term: int | None = None) -> int:
         """Add to how many workers a running trial has lost, and give that number."""

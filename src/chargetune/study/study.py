@@ -27,7 +27,8 @@ from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.notebook import study_html, trials_dataframe
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.records import result_of
+from chargetune.study.records import ResultRecord, result_of
+from chargetune.study.result import StudyResult, by_performance, made_from, read_result, with_belief
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
 from chargetune.study.store import Store, StudyRecord
@@ -132,26 +133,38 @@ class Study:
         return [t for t in self.trials() if t.status is TrialStatus.RUNNING]
 
     def best(self) -> Trial | None:
-        """The trial of the largest objective that kept every limit."""
+        """The trial of the largest objective that was measured to keep every limit; the `result` may be another."""
         return best_feasible(self.trials())
 
     def best_performance(self) -> Trial | None:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
         return best_performance(self.trials())
 
-    def believed_best(self, count: int | None = None) -> Trial | None:
-        """Of the first ``count`` trials the one that the tuner believes best from all traces, None where it does not say.
+    def result(self) -> StudyResult:
+        """The result of the study as it stands, and why: the one that every command and page shows.
 
-        One noisy verdict does not decide it (`TwinTuner.best`, `Composite.best`). But a trial that was measured to break a limit, by
-        more than its noise explains, is no result, and one of an earlier study is not this one's.
+        The tuner is asked which trial it believes best from all traces (`TwinTuner.best`, `Composite.best`, which may take seconds),
+        see `with_belief` for what that counts; the answer is stored. A stored one of exactly these told trials is given at once.
+        `run` does this when it ends, not when it is interrupted. A trial told later makes the stored result one of other trials:
+        `read_result`, and so `show`, `certify` and the pages, then takes what was measured, and says so, until this is called.
         """
+        trials = self.trials()
+        known = read_result(self.store, self.record, trials)
+        if known.asked:
+            return known
+        own = by_performance(self.record.identity)
+        found = with_belief(trials, lambda: self._believed_best(trials), by_performance=own)
+        number = None if found.trial is None else found.trial.number
+        made = ResultRecord(number, found.reason.value, made_from(self.record, trials))
+        self.store.set_result(self.record.id, made, term=self.term)
+        return found
+
+    def _believed_best(self, trials: Sequence[Trial]) -> Trial | None:
+        """The trial that the tuner believes best from all traces; None where it does not say, or names one of an earlier study."""
         best = getattr(self.tuner, "best", None)
-        known = [t for t in self._traced(self.trials()[:count]) if t.status is not TrialStatus.RUNNING]
-        index = None if best is None else best(self.space, known)
-        if index is None or index < len(self.earlier):
-            return None
-        found = known[index]
-        return found if found.score is not None and found.score.feasible else None
+        told = [t for t in trials if t.status is not TrialStatus.RUNNING]
+        index = None if best is None else best(self.space, self._traced(told))
+        return None if index is None or index < len(self.earlier) else told[index - len(self.earlier)]
 
     def trials_dataframe(self) -> Any:
         """All trials as a pandas data frame, see `trials_dataframe`. Raises ImportError without pandas."""
@@ -159,7 +172,8 @@ class Study:
 
     def _repr_html_(self) -> str:
         about = {"tuner": type(self.tuner).__name__, "store": self.store.label}
-        return study_html(self.record.name, about, self.space, self.trials())
+        trials = self.trials()
+        return study_html(self.record.name, about, self.space, trials, read_result(self.store, self.record, trials))
 
     def trace(self, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
         """Arrays and metadata of a trial's episode, None when none was stored."""
@@ -235,7 +249,7 @@ class Study:
         attempts: int = 3,
         progress: Progress | bool | None = None,
     ) -> Trial | None:
-        """Evaluate until the study has ``trials`` told trials, and return the best feasible one.
+        """Evaluate until the study has ``trials`` told trials, and return the result where it kept every limit, else None.
 
         executor
             Any executor of the caller's; None evaluates in this process, or with ``workers`` in processes of its own.
@@ -254,10 +268,24 @@ class Study:
 
         Trials that a dead process left running are evaluated first, again, with the same theta and seed. What ``evaluate`` raises
         makes that trial failed and the study goes on. On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt
-        passes on; the same call resumes.
+        passes on; the same call resumes. When all are told the tuner is asked for the `result`; `advance` leaves that out.
         Raises ValueError for bad arguments, WorkerError when the executor gives no results, StudyError for trials that may not be
         repeated.
         """
+        self.advance(evaluate, trials, executor=executor, workers=workers, attempts=attempts, progress=progress)
+        return self.result().kept
+
+    def advance(
+        self,
+        evaluate: Evaluate,
+        trials: int,
+        *,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        attempts: int = 3,
+        progress: Progress | bool | None = None,
+    ) -> None:
+        """As `run`, without asking for the result: for who goes on at once."""
         for name, value in (("trials", trials), ("attempts", attempts), ("workers", 1 if workers is None else workers)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} = {value!r}, allowed is an integer >= 1")
@@ -298,7 +326,6 @@ class Study:
             finished = stack.enter_context(closing(outcomes(evaluate, following, executor, losses)))
             for trial, outcome in finished:
                 tally.add(self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt))
-            return tally.incumbent
 
     def _ask_ahead(self, limit: int) -> list[Trial]:
         """One more trial while others are running; none when there are ``limit`` trials."""

@@ -48,6 +48,7 @@ async def study_events(watch: StoreWatch, study_id: int, ending: Ending = _never
     """``study``: its head, at once and when it changed; ``trials``: rows of new and newly told trials, all of them after a head."""
     head: Mapping[str, Any] | None = None
     sent: dict[int, str] = {}
+    result: Mapping[str, Any] | None = None
     async for views in _changes(watch, study_id, ending):
         if views is None:
             yield ALIVE
@@ -63,7 +64,10 @@ async def study_events(watch: StoreWatch, study_id: int, ending: Ending = _never
             head, sent = new_head, {}
             yield _event("study", head)
         fresh = [t for t in view.trials if sent.get(t.number) != t.status]
-        if fresh or not sent:
+        # The tuner is asked for the result once all trials are told.
+        told = view.result.facts()
+        if fresh or not sent or told != result:
+            result = told
             rows = await asyncio.to_thread(trial_rows, view, fresh)
             untuned, tuned = view.untuned, view.tuned
             sent |= {t.number: t.status for t in fresh}
@@ -74,6 +78,7 @@ async def study_events(watch: StoreWatch, study_id: int, ending: Ending = _never
                     "untuned": None if untuned is None else untuned.number,
                     "tuned": None if tuned is None else tuned.number,
                     "tuned_label": view.tuned_label,
+                    "result": result,
                 },
             )
 

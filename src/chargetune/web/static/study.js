@@ -6,7 +6,7 @@ const rows = new Map(), lines = new Map(), drawings = new Map(), places = new Ma
 // A browser takes seconds over a table of thousands of lines: more are added when one scrolls to the end.
 const MORE = 100;
 const sorting = { key: "number", down: true, count: MORE };
-let head = null, untuned = null, tuned = null, tunedLabel = "tuned", chosen = fromAddress();
+let head = null, result = null, untuned = null, tuned = null, tunedLabel = "tuned", chosen = fromAddress();
 let columns = [];
 
 const FIXED = [
@@ -278,14 +278,18 @@ const state = (text, kind) => {
   where("state").className = kind;
 };
 
+function about() {
+  const why = result && (result.trial === null ? `no result: ${result.sentence}` : `the result is trial ${result.trial}: ${result.sentence}`);
+  const parts = [head.cell, head.tuner && `tuner ${head.tuner}`, `${head.theta.length} entries of theta`, head.remark, why];
+  where("about").textContent = parts.filter(Boolean).join("; ");
+}
 source.addEventListener("study", (event) => {
   head = JSON.parse(event.data);
   rows.clear();
   lines.clear();
   document.title = `chargetune: ${head.name}`;
   where("name").textContent = head.name;
-  const about = [head.cell, head.tuner && `tuner ${head.tuner}`, `${head.theta.length} entries of theta`, head.remark];
-  where("about").textContent = about.filter(Boolean).join("; ");
+  about();
 });
 source.addEventListener("trials", (event) => {
   const news = JSON.parse(event.data);
@@ -293,7 +297,8 @@ source.addEventListener("trials", (event) => {
     rows.set(row.number, row);
     lines.delete(row.number);
   }
-  ({ untuned, tuned, tuned_label: tunedLabel } = news);
+  ({ untuned, tuned, tuned_label: tunedLabel, result } = news);
+  about();
   tell();
   showTable();
   state("live", "good");

@@ -1,0 +1,138 @@
+"""The one result of a study: which trial it is, and why. Every command and page reads it here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from chargetune.episode.score import Score, in_tolerances
+from chargetune.study.document import canonical_json, sha256
+from chargetune.study.records import StudyRecord
+from chargetune.study.store import Store
+from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
+
+__all__ = ["Reason", "StudyResult", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]
+
+
+class Reason(StrEnum):
+    """Why a trial is the result."""
+
+    BELIEVED = "believed"
+    MEASURED = "measured"
+    CLEAR = "clear"
+    CLOSEST = "closest"
+    PERFORMANCE = "performance"
+    NONE = "none"
+
+
+SENTENCES = {
+    Reason.BELIEVED: "the tuner believes it best from all traces",
+    Reason.MEASURED: "it is the best that was measured to keep every limit",
+    Reason.CLEAR: "it kept every limit by more than the tolerance, and was measured better than the trial that the tuner believes best",
+    Reason.CLOSEST: "no trial kept every limit, and it came closest, in tolerances",
+    Reason.PERFORMANCE: "it has the best performance G, which weighs violations",
+    Reason.NONE: "no trial has a score",
+}
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """The trial that is the result of a study, None only where no trial has a score.
+
+    ``asked`` says whether the tuner had its say on exactly these trials. Where it is False the verdicts measured alone decide: the
+    study is running, was interrupted, is of an older program, or only some of its trials are looked at.
+    """
+
+    trial: Trial | None
+    reason: Reason
+    asked: bool = True
+
+    @property
+    def sentence(self) -> str:
+        """Why, for people: one clause without a capital and a stop."""
+        aside = "" if self.asked else " (by the verdicts alone; the tuner was not asked about these trials)"
+        return SENTENCES[self.reason] + aside
+
+    @property
+    def kept(self) -> Trial | None:
+        """The trial where it was measured to keep every limit, else None."""
+        return self.trial if self.trial is not None and self.trial.feasible else None
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data: ``trial``, ``reason``, ``asked``, ``sentence``."""
+        number = None if self.trial is None else self.trial.number
+        return {"trial": number, "reason": self.reason.value, "asked": self.asked, "sentence": self.sentence}
+
+
+def measured_result(trials: Sequence[Trial], *, by_performance: bool = False, asked: bool = True) -> StudyResult:
+    """The result by what was measured alone.
+
+    The largest objective of those that kept every limit; where none did the least `Score.worst`; with ``by_performance`` the
+    largest performance G. The earlier one of equals.
+    """
+    scored = [t for t in trials if t.score is not None]
+    if not scored:
+        # There is nothing that a tuner could be asked.
+        return StudyResult(None, Reason.NONE)
+    if by_performance:
+        return StudyResult(best_performance(scored), Reason.PERFORMANCE, asked)
+    best = best_feasible(scored)
+    if best is not None:
+        return StudyResult(best, Reason.MEASURED, asked)
+    closest = min(scored, key=lambda t: (t.score.worst if t.score else 0.0, t.number))
+    return StudyResult(closest, Reason.CLOSEST, asked)
+
+
+def with_belief(trials: Sequence[Trial], best: Callable[[], Trial | None], *, by_performance: bool) -> StudyResult:
+    """The result where the tuner is asked, too: ``best`` gives the trial that it believes best from all traces.
+
+    A single noisy verdict does not decide; neither does a belief against what was measured beyond doubt. So it counts only for
+    a trial that was measured to keep every limit, and not where another one has a better objective and kept every limit by more
+    than its tolerance, which is what noise and rounding explain: of that one there is nothing to believe.
+    """
+    measured = measured_result(trials, by_performance=by_performance)
+    if measured.reason is not Reason.MEASURED:
+        return measured
+    believed = best()
+    if believed is None or believed.score is None or not believed.feasible:
+        return measured
+    clear = best_feasible(t for t in trials if t.score is not None and _clearly_kept(t.score))
+    if clear is not None and clear.score is not None and clear.score.objective > believed.score.objective:
+        # The best of all that were measured to keep the limits may be one that only noise lets pass.
+        return StudyResult(clear, Reason.MEASURED if clear == measured.trial else Reason.CLEAR)
+    return StudyResult(believed, Reason.BELIEVED)
+
+
+def read_result(store: Store, record: StudyRecord, trials: Sequence[Trial] | None = None) -> StudyResult:
+    """The result of a study from the store alone, which may be open for reading only; ``trials`` are those looked at, else all.
+
+    The stored one holds for exactly the told trials that it was made from, and for the study as it was then. For others, and where
+    none is stored, it is what was measured, with ``asked`` False.
+    """
+    trials = store.trials(record.id) if trials is None else trials
+    stored = store.result(record.id)
+    if stored is not None and stored.made_from == made_from(record, trials):
+        trial = next((t for t in trials if t.number == stored.number), None)
+        if (trial is None) == (stored.number is None) and stored.reason in set(Reason):
+            return StudyResult(trial, Reason(stored.reason))
+    return measured_result(trials, by_performance=by_performance(record.identity), asked=False)
+
+
+def _clearly_kept(score: Score) -> bool:
+    return all(in_tolerances(value, score.tolerance.get(name, 0.0), -1.0) <= 0 for name, value in score.excess.items())
+
+
+def made_from(record: StudyRecord, trials: Sequence[Trial]) -> str:
+    """SHA-256 of what a result depends on: the study's identity, and which trials are told; what was told does not change."""
+    told = [t.number for t in trials if t.status is not TrialStatus.RUNNING]
+    return sha256(canonical_json({"study": record.identity_sha256, "told": told}, "result"))
+
+
+def by_performance(identity: Mapping[str, Any]) -> bool:
+    """Whether a study is of the paper's method, whose incumbent is the best performance G."""
+    config, tuner = identity.get("config"), identity.get("tuner")
+    named = config.get("study") if isinstance(config, Mapping) else None
+    name = named.get("tuner") if isinstance(named, Mapping) else None
+    return name == "ei" or (isinstance(tuner, Mapping) and tuner.get("type") == "ExpectedImprovement")
