@@ -14,13 +14,16 @@ from unittest.mock import patch
 
 import numpy as np
 
-from chargetune.learning import belief, safe_ask, twin_search, twin_tuner
-from chargetune.learning.belief import windows_of
-from chargetune.learning.corner import Point
-from chargetune.learning.discrepancy import Discrepancy, OutputError
-from chargetune.learning.posterior import Posterior
-from chargetune.learning.safe_ask import SURE, SafeAsk
-from chargetune.learning.twin_search import Search
+from chargetune.learning import safe_mode as safe_ask
+from chargetune.learning import twin_tuner
+from chargetune.learning.closed_loop import search as twin_search
+from chargetune.learning.closed_loop.loop import windows_of
+from chargetune.learning.closed_loop.search import Search
+from chargetune.learning.closed_loop.slp import Point
+from chargetune.learning.safe_mode import SURE, SafeAsk
+from chargetune.learning.twin import ensemble as belief
+from chargetune.learning.twin.discrepancy import Discrepancy, OutputError
+from chargetune.learning.twin.posterior import Posterior
 from learning import arguments, measure, run
 
 _error = Discrepancy._error  # noqa: SLF001 - what is taken away has no public name

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from peers import do_mpc_loop, ipopt_loop
 
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import Backoff, ChargingProblem
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import Backoff, ChargingProblem
 from chargetune.episode.compiled import compiled_episode
 
 SEEDS = (None, 0, 1, 2, 3, 4)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from chargetune.episode.episode import Episode
-from chargetune.learning.belief import Belief, believe
-from chargetune.learning.safe_ask import SURE, SURE_UNPROVED
+from chargetune.learning.safe_mode import SURE, SURE_UNPROVED
+from chargetune.learning.twin.ensemble import Belief, believe
 from learning import METHODS
 
 TRIALS, PLANTS_DRAWN, NOISE_V, STATED = 3, 96, 2e-3, 0.9

@@ -14,10 +14,10 @@ from itertools import product
 
 import numpy as np
 
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import Backoff, ChargingProblem
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import Backoff, ChargingProblem
 from chargetune.episode.compiled import compiled_episode
-from chargetune.episode.cores import usable_cores
+from chargetune.runtime.threads import usable_cores
 
 THETAS, PLANTS = 5, 200
 

@@ -36,10 +36,10 @@ from rich.progress import track
 from rich.table import Column, Table
 
 from chargetune import learning
-from chargetune.battery.twin import ChargingTwin
-from chargetune.battery.windows import ChargingWindows
-from chargetune.learning.tuner import sobol_points
-from chargetune.learning.twin_search import Search
+from chargetune.battery.charging.soc_windows import ChargingWindows
+from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.learning.closed_loop.search import Search
+from chargetune.learning.initial_design import sobol_points
 from chargetune.study.result import measured_result
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0

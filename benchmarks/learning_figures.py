@@ -16,7 +16,19 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from chargetune.report.style import BLUE, GREEN, GREY, ORANGE, PAGE_IN, RED, check_format, journal_style, legend_above, new_figure, save
+from chargetune.report.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PAGE_IN,
+    RED,
+    check_format,
+    journal_style,
+    legend_above,
+    new_figure,
+    save,
+)
 
 LOOKS: dict[str, dict[str, Any]] = {
     "safe": {"color": BLUE, "marker": "o"},

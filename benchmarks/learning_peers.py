@@ -10,7 +10,7 @@ import numpy as np
 import optuna
 from numpy.typing import NDArray
 
-from chargetune.model.parameters import ParameterSpace
+from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["CmaEs", "Tpe"]
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import casadi as ca
 
-from chargetune.battery.cell import Cell, default_cell
-from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.config import load_config
-from chargetune.battery.ecm import ecm_model, start_state
-from chargetune.battery.electrochemical import Electrochemical
-from chargetune.battery.theta import Backoff, LimitBackoff, ResistanceRatio
+from chargetune.battery.cell.cell import Cell, default_cell
+from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio
+from chargetune.battery.plants.electrochemical import Electrochemical
+from chargetune.battery.studies.study_file import load_config
 from chargetune.model.model import Model, Signal
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant

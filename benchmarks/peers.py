@@ -10,7 +10,7 @@ import warnings
 import casadi as ca
 import numpy as np
 
-from chargetune.battery.ecm import ecm_model
+from chargetune.battery.cell.equivalent_circuit import ecm_model
 
 LOWEST_V, LIMIT_V, CURRENT_MAX_A, PENALTY = 2.5, 4.2, 6.0, 1e3
 

@@ -12,10 +12,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from chargetune.battery.cell import load_cell
-from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.electrochemical import Electrochemical, ElectrochemicalPlant, _built
-from chargetune.battery.estimation import Kalman
+from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.charging.kalman import Kalman
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.plants.electrochemical import Electrochemical, ElectrochemicalPlant, _built
 
 STEPS, ROUNDS = 120, 3
 CELL = Path(__file__).parents[1] / "examples" / "okane2022.toml"

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
-from chargetune.study.document import score_to_json
-from chargetune.study.store import Store
+from chargetune.model.parameter_space import Parameter, ParameterSpace
+from chargetune.study.serialization import score_to_json
+from chargetune.study.store.store import Store
+from chargetune.study.store.trace import encode
 from chargetune.study.study import Study
-from chargetune.study.trace import encode
 from chargetune.study.trial import Trial, TrialStatus
 
 SPACE = ParameterSpace(tuple(Parameter(f"backoff_{k}", 0.0, 0.2, 0.1) for k in range(16)))

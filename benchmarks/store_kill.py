@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
-from chargetune.study.check import check_store
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.study.evaluation import trial_seed
-from chargetune.study.store import Store
+from chargetune.study.store.integrity import check_store
+from chargetune.study.store.store import Store
+from chargetune.study.store.trace import content_sha256
 from chargetune.study.study import Study
-from chargetune.study.trace import content_sha256
 
 # A fork is at work in a millisecond, so that kills fall into the work and not into imports.
 FORK = multiprocessing.get_context("fork")

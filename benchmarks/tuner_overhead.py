@@ -14,7 +14,7 @@ import numpy as np
 
 from chargetune.episode.score import Score
 from chargetune.learning import ConstrainedLogEI, ExpectedImprovement
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 COUNTS = (20, 60, 120)
 DIMENSIONS = (7, 16)

@@ -14,13 +14,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from chargetune.battery.cell import load_cell
-from chargetune.battery.charging import Backoff, ChargingProblem
-from chargetune.battery.electrochemical import Electrochemical
-from chargetune.battery.estimation import Kalman
+from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.charging.kalman import Kalman
+from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.learning import ConstrainedLogEI, Sobol
 from chargetune.study.executors import process_executor
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 
 CELL = Path(__file__).parents[1] / "examples" / "okane2022.toml"

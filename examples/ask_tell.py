@@ -5,9 +5,9 @@ Here the charge is simulated; on a test bench `charge` would run the cycler. Run
 
 import sys
 
-from chargetune.battery.config import case_study
+from chargetune.battery.case_study.configurations import case_study
 from chargetune.learning import ConstrainedLogEI
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 
 

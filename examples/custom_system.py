@@ -18,9 +18,9 @@ from chargetune.episode.score import Score
 from chargetune.learning import ConstrainedLogEI
 from chargetune.model.integrators import rk4
 from chargetune.model.model import Model, Signal
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 
 TS, STEPS, SWING_MAX_RAD = 0.1, 80, 0.10

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from chargetune.battery.baselines import charge, constant_current
-from chargetune.battery.electrochemical import Electrochemical
-from chargetune.battery.identify import cell_toml, identify
-from chargetune.battery.identify_anode import with_anode
-from chargetune.battery.identify_thermal import activation_energy, with_thermal
-from chargetune.battery.limits import Limit
-from chargetune.battery.pulse_test import pulse_test, slow_cycle
-from chargetune.battery.record import Record
+from chargetune.battery.baselines.charging_protocols import charge, constant_current
+from chargetune.battery.charging.limits import Limit
+from chargetune.battery.identification.anode import with_anode
+from chargetune.battery.identification.pulse_fit import cell_toml, identify
+from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.thermal import activation_energy, with_thermal
+from chargetune.battery.identification.virtual_bench import pulse_test, slow_cycle
+from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.plants.sensors import Sensors
 
 

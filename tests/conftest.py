@@ -4,6 +4,7 @@ import itertools
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -14,6 +15,10 @@ from hypothesis import settings
 # Before the first import of numpy or torch: each test process has one core, and more threads would only fight for it.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+# The fixtures of small closed loops are importable by name.
+sys.path.insert(0, str(Path(__file__).parent))
+pytest_plugins = ["closed_loops"]
 
 # A shell has it ignored by what it starts in the background, and no test of an interruption would pass there.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

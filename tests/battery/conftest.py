@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chargetune.battery.cell import default_cell
+from chargetune.battery.cell.cell import default_cell
 from chargetune.episode.episode import Ending, Episode
 
 # The BPX cell of these tests is importable by name.

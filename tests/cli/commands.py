@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 from chargetune.cli import main
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.store import Store, StoreError
 
 
 def run(*arguments, cwd=None):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from commands import chargetune
 
-from chargetune.battery.campaign import load_campaign
+from chargetune.battery.studies.campaign import load_campaign
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from chargetune.cli import app as cli
-from chargetune.study.store import StoreError
+from chargetune.study.store.store import StoreError
 
 
 @pytest.fixture

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 import pytest
 from commands import chargetune
 
-from chargetune.battery.campaign import load_campaign, standings
-from chargetune.battery.export import export
-from chargetune.battery.reproduce import open_study, seed_run
-from chargetune.report.page import report_page
-from chargetune.report.reading import read_studies, read_study
-from chargetune.report.rows import study_summary
+from chargetune.battery.case_study.reproduce import seed_run
+from chargetune.battery.studies.bdf_export import export
+from chargetune.battery.studies.campaign import load_campaign, standings
+from chargetune.battery.studies.open_study import open_study
+from chargetune.report.page.page import report_page
+from chargetune.report.page.trial_rows import study_summary
+from chargetune.report.study_view import read_studies, read_study
 from chargetune.study.result import Reason
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.trial import best_feasible
 from chargetune.web.events import study_events
 from chargetune.web.watch import StoreWatch

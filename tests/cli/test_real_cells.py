@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from commands import chargetune
 
-from chargetune.battery.cell import load_cell
-from chargetune.battery.config import load_config
+from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.studies.study_file import load_config
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from commands import told
 
-from chargetune.battery.cell import load_cell
-from chargetune.battery.charging import Backoff, ChargingProblem
-from chargetune.battery.electrochemical import Electrochemical
+from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.learning import Sobol
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 
 CONFIG = """

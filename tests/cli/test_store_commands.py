@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from chargetune.cli import main
-from chargetune.study.salvage import salvage
+from chargetune.study.store.salvage import salvage
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -120,7 +120,7 @@ def test_export(damaged, run, tmp_path):
 
 
 def test_export_without_pyarrow(store, run, tmp_path, monkeypatch):
-    import chargetune.battery.export as module
+    import chargetune.battery.studies.bdf_export as module
 
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     code, _, err = run("store", "export", store, "--out", tmp_path / "out")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from commands import run
 
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import ChargingProblem, ResistanceRatio
-from chargetune.battery.config import load_config
-from chargetune.battery.reproduce import make_tuner
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.studies.open_study import make_tuner
+from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.tune import _closing
 from chargetune.study.result import Reason, StudyResult
 from chargetune.study.trial import Trial, TrialStatus

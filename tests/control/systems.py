@@ -5,9 +5,9 @@ import numpy as np
 
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.estimators import ExactState
-from chargetune.control.ipopt import multiple_shooting
+from chargetune.control.ipopt_reference import multiple_shooting
 from chargetune.model.model import Model, Signal
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 __all__ = ["SLOTS", "SPACE", "controller", "ipopt_solution", "model", "plant_model", "random_point"]
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from systems import SPACE, controller, plant_model
 
+from chargetune.control.control_step import act, compiled_act
 from chargetune.control.controller import SoftLimit
 from chargetune.control.estimators import ExtendedKalman
-from chargetune.control.mpc import act, compiled_act
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from systems import controller, ipopt_solution, random_point
 
+from chargetune.control.control_step import problem_of
 from chargetune.control.controller import SoftLimit
-from chargetune.control.mpc import problem_of
 from chargetune.control.sqp import KKT_TOLERANCE, cold, solver
 
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from systems import controller, model
 
+from chargetune.control.control_step import problem_of
 from chargetune.control.controller import SoftLimit
-from chargetune.control.mpc import problem_of
 from chargetune.control.ocp import row_weight
 from chargetune.control.sqp import SolveStatus, cold, solver
 from chargetune.episode.compiled import simulate

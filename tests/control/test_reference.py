@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import Backoff, ChargingProblem
-from chargetune.control.ipopt import ipopt_act
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
 

@@ -6,16 +6,16 @@ import pytest
 from systems import SPACE, controller, ipopt_solution, plant_model, random_point
 
 from chargetune.control import sqp
+from chargetune.control.control_step import act, begin, control_step, problem_of
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.estimators import ExactState, Propagated
-from chargetune.control.ipopt import ipopt_act
-from chargetune.control.mpc import act, begin, control_step, problem_of
+from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.control.qp import daqp
 from chargetune.control.sqp import KKT_TOLERANCE, SolveStatus, cold, solver
 from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model, Signal
-from chargetune.model.parameters import ParameterSpace
+from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from systems import controller, plant_model
 
+from chargetune.control.control_step import problem_of
 from chargetune.control.estimators import ExtendedKalman
-from chargetune.control.mpc import problem_of
 from chargetune.episode.compiled import compiled_episode, simulate
-from chargetune.episode.lattice import Lattice
+from chargetune.episode.lookup_table import Lattice
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Signal
 from chargetune.plants.simulated import SimulatedPlant

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from chargetune.control.compiler import find_compiler
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
-from chargetune.episode.lattice import Lattice
+from chargetune.episode.lookup_table import Lattice
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
+from chargetune.runtime.compiler import find_compiler
 
 NOISY = Sensors({"voltage_V": 2e-3, "soc": 1e-3}, {"voltage_V": 5e-3}, {"voltage_V": 1e-3, "soc": 1e-4})
 KALMAN = ExtendedKalman(("voltage_V", "soc"), (5e-3, 1e-3), (1e-4, 1e-3), (1e-2, 1e-2))

@@ -9,7 +9,7 @@ import pytest
 
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at
-from chargetune.study.trace import decode, encode
+from chargetune.study.store.trace import decode, encode
 
 STEPS = 6
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
-from chargetune.control.ipopt import ipopt_act
+from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.episode.compiled import simulate
 from chargetune.episode.episode import Ending
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model, Signal
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chargetune.control.control_step import act
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
-from chargetune.control.mpc import act
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
 from chargetune.episode.stepwise import run_episode, signal_indices

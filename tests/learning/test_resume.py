@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import ChargingProblem, ResistanceRatio
-from chargetune.battery.twin import ChargingTwin
-from chargetune.battery.windows import ChargingWindows
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.soc_windows import ChargingWindows
+from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning import Composite, Envelope, Safety, TwinTuner
-from chargetune.learning.belief import believe
+from chargetune.learning.twin.ensemble import believe
 from chargetune.plants.sensors import Sensors
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 
 # 24 intervals near full, where the voltage limit is met.

@@ -7,9 +7,9 @@ import pytest
 
 from chargetune.episode.score import Score
 from chargetune.learning import NoSafeThetaError, Safety
-from chargetune.learning.belief import Prediction
-from chargetune.learning.safe_ask import SafeAsk
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.learning.safe_mode import SafeAsk
+from chargetune.learning.twin.ensemble import Prediction
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 
 class Verdict:

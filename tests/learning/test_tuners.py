@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from chargetune.learning import ConstrainedLogEI, ExpectedImprovement, Sobol
-from chargetune.learning.tuner import initial_design, sobol_points
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.learning.initial_design import initial_design, sobol_points
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 SPACE = ParameterSpace((Parameter("a", 0.0, 1.0, 0.9, size=2), Parameter("r", 0.1, 10.0, 1.0, scale="log")))
 TUNERS = [ConstrainedLogEI(seed=3), ExpectedImprovement(seed=3), Sobol(seed=3)]

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from chargetune.battery.cell import Cell
-from chargetune.battery.ecm import ecm_model, start_state
+from chargetune.battery.cell.cell import Cell
+from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.plants.simulated import SimulatedPlant
 
 

@@ -6,12 +6,21 @@ from itertools import count
 import numpy as np
 from scipy.stats import qmc
 
-from chargetune.battery.config import BackoffTable, Config, ControllerTable, EpisodeTable, LimitsTable, RatioTable, StudyTable, ThetaTable
+from chargetune.battery.studies.study_file import (
+    BackoffTable,
+    Config,
+    ControllerTable,
+    EpisodeTable,
+    LimitsTable,
+    RatioTable,
+    StudyTable,
+    ThetaTable,
+)
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
-from chargetune.study.document import space_to_json
-from chargetune.study.store import Store
+from chargetune.model.parameter_space import Parameter, ParameterSpace
+from chargetune.study.serialization import space_to_json
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 from chargetune.study.trial import Trial
 

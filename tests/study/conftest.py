@@ -7,7 +7,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.study.evaluation import trial_seed
 from chargetune.study.study import Study
 

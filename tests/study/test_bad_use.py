@@ -13,7 +13,7 @@ from study_toy import Toy, essence, open_study
 import chargetune
 from chargetune.episode.score import Score
 from chargetune.study.executors import process_executor
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.store import Store, StoreError
 
 GOOD = Score(1.0, 1.0, {"v": -0.1}, {"v": 0.0}, {"t80_min": None})
 

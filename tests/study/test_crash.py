@@ -14,10 +14,10 @@ import pytest
 from sqlalchemy import Engine, event
 from study_toy import Toy, essence, open_study, told_by_another_process
 
-from chargetune.study.check import check_store
 from chargetune.study.executors import process_executor
-from chargetune.study.lease import take_lease
-from chargetune.study.store import Store
+from chargetune.study.store.integrity import check_store
+from chargetune.study.store.lease import take_lease
+from chargetune.study.store.store import Store
 from chargetune.study.study import StudyError
 
 # A fork starts in a millisecond, so that the kills fall into the work and not into the imports.

@@ -8,7 +8,7 @@ import pytest
 from distributed import Client, LocalCluster
 from study_toy import Deadly, Toy, Waits, essence, open_study
 
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from study_toy import Deadly, OnlyHere, Toy, essence, open_study
 
 from chargetune.study.executors import process_executor
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import StudyError, WorkerError
 
 

@@ -2,7 +2,7 @@ import pytest
 from study_toy import Toy, essence, open_study
 
 from chargetune.learning import ConstrainedLogEI, ExpectedImprovement, Sobol
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 
 # Deprecations inside of linear_operator when candidates are drawn jointly; no matter of the study.

@@ -8,8 +8,8 @@ from study_toy import Halfway, Toy, open_study
 from chargetune.episode.score import Score
 from chargetune.learning import ExpectedImprovement, Sobol
 from chargetune.study.result import Reason, measured_result, read_result, with_belief
-from chargetune.study.salvage import salvage
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.salvage import salvage
+from chargetune.study.store.store import Store, StoreError
 from chargetune.study.trial import Trial, TrialStatus
 
 

@@ -13,9 +13,9 @@ from study_toy import Toy, ToyEpisode, open_study
 
 from chargetune.episode.score import Score
 from chargetune.study.evaluation import evaluate_trial
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.store import Store, StoreError
+from chargetune.study.store.trace import decode, encode
 from chargetune.study.study import StudyError
-from chargetune.study.trace import decode, encode
 
 SCORES = st.builds(
     lambda value, excess: Score(value, value - max(0.0, excess), {"v": excess}, {"v": 0.0}), st.floats(-9, 9), st.floats(-1, 1)

@@ -8,9 +8,9 @@ import pytest
 from study_toy import CONFIG, SEED, SPACE, Halfway, Toy, ToyEpisode, essence, open_study
 
 from chargetune.episode.score import Score
-from chargetune.model.parameters import Parameter, ParameterSpace
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.study.evaluation import trial_seed
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.store import Store, StoreError
 from chargetune.study.study import StudyError
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 

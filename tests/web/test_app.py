@@ -12,7 +12,7 @@ from html_check import parsed
 from report_studies import HOSTILE, charging, run_charging
 from starlette.testclient import TestClient
 
-from chargetune.report.reading import read_studies
+from chargetune.report.study_view import read_studies
 from chargetune.web.app import make_app
 
 ONE = "/studies/1"
@@ -137,10 +137,10 @@ def test_a_store_that_went_away_is_said(tmp_path):
 
 
 def test_trace_that_is_no_episode(tmp_path):
-    from chargetune.model.parameters import Parameter, ParameterSpace
-    from chargetune.study.document import space_to_json
-    from chargetune.study.store import Store
-    from chargetune.study.trace import encode
+    from chargetune.model.parameter_space import Parameter, ParameterSpace
+    from chargetune.study.serialization import space_to_json
+    from chargetune.study.store.store import Store
+    from chargetune.study.store.trace import encode
     from chargetune.study.trial import Trial
 
     space = ParameterSpace((Parameter("x", 0.0, 1.0, 0.0),))

@@ -59,7 +59,7 @@ def test_every_panel_is_drawn(open_page, address, store):
     limits = page.evaluate("document.querySelectorAll('#signals .plot')[2].layout.shapes.map((shape) => shape.y0)")
     assert limits == [2.5, 4.2]
     best = page.evaluate("document.querySelector('#convergence .plot').data.find((trace) => trace.name === 'best so far').y")
-    from chargetune.report.convergence import incumbents
+    from chargetune.report.figures.convergence import incumbents
 
     np.testing.assert_allclose([np.nan if v is None else v for v in best], incumbents(view), rtol=1e-6)
     assert page.wrong == []

@@ -7,8 +7,8 @@ from itertools import count
 from report_studies import LocalSobol, charging
 
 from chargetune.episode.score import Score
-from chargetune.study.document import space_to_json
-from chargetune.study.store import Store
+from chargetune.study.serialization import space_to_json
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 from chargetune.study.trial import Trial
 

@@ -7,9 +7,9 @@ import pytest
 from report_studies import TRIALS, charging, run_charging
 
 from chargetune.episode.score import Score
-from chargetune.study.records import ResultRecord
 from chargetune.study.result import made_from
-from chargetune.study.store import Store
+from chargetune.study.store.rows import ResultRecord
+from chargetune.study.store.store import Store
 from chargetune.study.trial import Trial
 from chargetune.web import events
 from chargetune.web.events import list_events, study_events
@@ -95,7 +95,7 @@ def test_a_study_without_trials_yet(tmp_path):
         path = tmp_path / "s.sqlite"
         config = charging()
         with Store(path) as opened:
-            from chargetune.study.document import space_to_json
+            from chargetune.study.serialization import space_to_json
 
             identity = {"config": config.document(), "space": space_to_json(config.problem().space), "tuner": {}, "seed": 0, "batch": 1}
             opened.add_study("empty", identity)

@@ -5,7 +5,7 @@ import time
 import pytest
 from report_studies import charging, run_charging
 
-from chargetune.study.store import Store, StoreError
+from chargetune.study.store.store import Store, StoreError
 from chargetune.study.trial import Trial
 from chargetune.web.watch import StoreWatch
 

@@ -258,7 +258,7 @@ def certify(
     as_json: AsJson = False,
 ) -> None:
     """Run the tuned controller on fresh episodes with other plants and bound the probability of a violation."""
-    from chargetune.battery.spread import Spread
+    from chargetune.battery.certification.variations import Spread
     from chargetune.cli.certify import certify_command
 
     certify_command(
@@ -364,8 +364,8 @@ def main() -> None:
         from pydantic import ValidationError
 
         from chargetune.study.identity import StudyError
-        from chargetune.study.records import StoreError
         from chargetune.study.runner import WorkerError
+        from chargetune.study.store.rows import StoreError
 
         if isinstance(error, (ValidationError, StudyError, StoreError, WorkerError)):
             _refuse(error)

@@ -13,12 +13,12 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from chargetune.battery.campaign import Entry, Standing, load_campaign, run_campaign, standings
-from chargetune.battery.charging_check import check_charging
+from chargetune.battery.charging.checks import check_charging
+from chargetune.battery.studies.campaign import Entry, Standing, load_campaign, run_campaign, standings
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, number, shown
 from chargetune.study.executors import process_executor
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 __all__ = ["campaign_command"]
 

@@ -9,15 +9,15 @@ from typing import Any
 
 from rich.table import Table
 
-from chargetune.battery.certificate import Charge, run_charges, write_certificate
-from chargetune.battery.config import problem_of_document
-from chargetune.battery.spread import Spread
+from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
+from chargetune.battery.certification.variations import Spread
+from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
-from chargetune.study.database import store_name
 from chargetune.study.executors import process_executor
 from chargetune.study.result import read_result
-from chargetune.study.store import Store
+from chargetune.study.store.database import store_name
+from chargetune.study.store.store import Store
 
 __all__ = ["certify_command"]
 
@@ -89,8 +89,8 @@ def certify_command(
         seed=seed,
         confidence=confidence,
     )
-    from chargetune.report.certificate import certificate_figure
-    from chargetune.report.style import save
+    from chargetune.report.figures.certificate import certificate_figure
+    from chargetune.report.figures.style import save
 
     figure = save(certificate_figure(target), target.with_suffix(".png"))
     if as_json:

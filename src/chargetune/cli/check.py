@@ -10,10 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
-from chargetune.battery.charging_check import check_charging
-from chargetune.battery.config import load_config
+from chargetune.battery.charging.checks import check_charging
+from chargetune.battery.studies.study_file import load_config
+from chargetune.checks.finding import Finding
 from chargetune.cli.output import console
-from chargetune.control.finding import Finding
 
 __all__ = ["check_command", "facts", "print_findings"]
 
@@ -33,7 +33,7 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, as_json
             findings = check_charging(problem, start=start)
     drawn: list[Path] = []
     if figures is not None and findings:
-        from chargetune.report.findings import save_findings
+        from chargetune.report.figures.check_findings import save_findings
 
         drawn = save_findings(findings, figures)
     if as_json:

@@ -9,14 +9,14 @@ from typing import Any
 
 from rich.table import Table
 
-from chargetune.battery.compare import Row, compare, row_names
-from chargetune.battery.config import load_config
+from chargetune.battery.baselines.comparison import Row, compare, row_names
+from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, number, result_line, shown
 from chargetune.cli.tune import bar
-from chargetune.report.style import check_format
+from chargetune.report.figures.style import check_format
 from chargetune.study.executors import process_executor
 from chargetune.study.result import StudyResult, read_result
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 __all__ = ["compare_command"]
 
@@ -42,8 +42,8 @@ def compare_command(
             progress.update(task, advance=1, note=row.name)
     rows = [found[name] for name in names]
     if figure is not None:
-        from chargetune.report.comparison import comparison_figure
-        from chargetune.report.style import save
+        from chargetune.report.figures.comparison import comparison_figure
+        from chargetune.report.figures.style import save
 
         save(comparison_figure(problem, rows), figure)
     if as_json:

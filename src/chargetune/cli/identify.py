@@ -11,13 +11,13 @@ from typing import Any, Literal, cast
 import numpy as np
 from rich.table import Table
 
-from chargetune.battery.cell import load_cell
-from chargetune.battery.cyclers import read_record
-from chargetune.battery.identify import Identification, cell_toml, identify, predicted_voltage
-from chargetune.battery.pulses import segments
-from chargetune.battery.record import Record
+from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.identification.cycler_files import read_record
+from chargetune.battery.identification.pulse_fit import Identification, cell_toml, identify, predicted_voltage
+from chargetune.battery.identification.pulses import segments
+from chargetune.battery.identification.record import Record
 from chargetune.cli.output import console
-from chargetune.report.style import check_format
+from chargetune.report.figures.style import check_format
 from chargetune.study.files import write_whole
 
 __all__ = ["identify_command"]
@@ -49,8 +49,8 @@ def identify_command(
     # What was written is what a controller will read.
     cell = load_cell(out)
     if figure is not None:
-        from chargetune.report.identification import identification_figure
-        from chargetune.report.style import save
+        from chargetune.report.figures.identification import identification_figure
+        from chargetune.report.figures.style import save
 
         save(identification_figure(replace(found, cell=cell)), figure)
     if as_json:

@@ -9,11 +9,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.score import Score
-from chargetune.study.database import database_at
 from chargetune.study.result import StudyResult
-from chargetune.study.sqlite import SqliteFile
+from chargetune.study.store.database import database_at
+from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
 __all__ = ["beside", "console", "metrics_table", "result_line", "shown", "theta_lines", "trials_table"]

@@ -8,8 +8,8 @@ from pathlib import Path
 from chargetune.cli.output import beside, console, shown
 from chargetune.cli.tune import bar
 from chargetune.report import read_study, save_figures
-from chargetune.report.page import report_page
-from chargetune.report.reading import read_studies
+from chargetune.report.page.page import report_page
+from chargetune.report.study_view import read_studies
 from chargetune.study.files import write_whole
 
 __all__ = ["report_command"]

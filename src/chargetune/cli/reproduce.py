@@ -8,8 +8,9 @@ from typing import Any, cast
 
 from rich.table import Table
 
-from chargetune.battery.config import TunerName, case_study
-from chargetune.battery.reproduce import reproduce, summarise
+from chargetune.battery.case_study.configurations import case_study
+from chargetune.battery.case_study.reproduce import reproduce, summarise
+from chargetune.battery.studies.study_file import TunerName
 from chargetune.cli.output import console, number
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from chargetune.cli.output import console, number, result_line, trials_table
 from chargetune.study.result import StudyResult, read_result
-from chargetune.study.store import Store, StudyRecord
+from chargetune.study.store.store import Store, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["show_command"]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.config import load_config
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, metrics_table
 
 __all__ = ["parse_theta", "simulate_command"]

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from chargetune.battery.export import Format, export
+from chargetune.battery.studies.bdf_export import Format, export
 from chargetune.cli.output import console, shown
-from chargetune.study.check import check_store
-from chargetune.study.readable import Finding
-from chargetune.study.salvage import salvage
-from chargetune.study.store import Store
+from chargetune.study.store.damaged_reader import Finding
+from chargetune.study.store.integrity import check_store
+from chargetune.study.store.salvage import salvage
+from chargetune.study.store.store import Store
 
 __all__ = ["check_command", "export_command", "migrate_command", "salvage_command"]
 

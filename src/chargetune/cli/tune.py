@@ -16,17 +16,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from chargetune.battery.charging import ChargingProblem
-from chargetune.battery.charging_check import check_charging
-from chargetune.battery.config import Config, load_config
-from chargetune.battery.reproduce import open_study
+from chargetune.battery.charging.checks import check_charging
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.open_study import open_study
+from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
 from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
 from chargetune.study.result import StudyResult, read_result
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 from chargetune.study.trial import Trial, TrialStatus
 

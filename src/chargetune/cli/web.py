@@ -6,7 +6,7 @@ import contextlib
 import socket
 
 from chargetune.cli.output import console
-from chargetune.study.store import Store
+from chargetune.study.store.store import Store
 
 __all__ = ["web_command"]
 

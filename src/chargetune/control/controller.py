@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.estimators import Estimator, ExactState
 from chargetune.model.model import Model, Named
-from chargetune.model.parameters import ParameterSpace
-from chargetune.model.split import split
+from chargetune.model.parameter_space import ParameterSpace
+from chargetune.runtime.split import split
 
 __all__ = ["Controller", "Limit", "SoftLimit", "Stage"]
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.model.model import Model, Named
-from chargetune.model.split import split
+from chargetune.runtime.split import split
 
 __all__ = ["Estimator", "ExactState", "ExtendedKalman", "Propagated", "finite"]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from chargetune.control.controller import Controller
 from chargetune.control.estimators import finite
-from chargetune.model.split import split
+from chargetune.runtime.split import split
 
 __all__ = ["Problem", "control_problem", "row_weight"]
 

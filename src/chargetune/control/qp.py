@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from chargetune.control.compiler import compile_library
+from chargetune.runtime.compiler import compile_library
 
 __all__ = ["QPSolver", "daqp", "daqp_warm", "warm_sources"]
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from chargetune.control.estimators import finite
 from chargetune.control.ocp import Problem
 from chargetune.control.qp import QPSolver, daqp
-from chargetune.model.split import split
+from chargetune.runtime.split import split
 
 __all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
 

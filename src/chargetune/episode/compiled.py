@@ -17,17 +17,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.compiler import compile_library, find_compiler
+from chargetune.control.control_step import begin, control_step, problem_of
 from chargetune.control.controller import Controller
-from chargetune.control.mpc import begin, cached, control_step, problem_of
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
-from chargetune.episode.cores import each
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
-from chargetune.episode.lattice import Lattice
+from chargetune.episode.lookup_table import Lattice
 from chargetune.episode.stepwise import check_run, signal_indices
-from chargetune.model.evaluated import evaluated
-from chargetune.model.split import split
 from chargetune.plants.simulated import SimulatedPlant, disturbances
+from chargetune.runtime.cache import cached
+from chargetune.runtime.compiler import compile_library, find_compiler
+from chargetune.runtime.numpy_call import evaluated
+from chargetune.runtime.split import split
+from chargetune.runtime.threads import each
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.control.sqp import SolveStatus
-from chargetune.episode.notebook import curves, facts
+from chargetune.episode.html_repr import curves, facts
 from chargetune.plants.plant import Measurement, Plant
 
 __all__ = ["BLIND_MAX", "Ending", "Episode", "Trip", "ending_at", "tripped"]

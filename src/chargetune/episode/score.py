@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.episode.notebook import facts, table
+from chargetune.episode.html_repr import facts, table
 
 __all__ = ["Score", "in_tolerances"]
 

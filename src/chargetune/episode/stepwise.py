@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.control.control_step import Act, act, begin
 from chargetune.control.controller import Controller
-from chargetune.control.mpc import Act, act, begin
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
 from chargetune.plants.plant import Measurement, Plant, PlantError

@@ -8,16 +8,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from chargetune.learning.composite import Composite
-    from chargetune.learning.constrained import ConstrainedLogEI
-    from chargetune.learning.envelope import Envelope
-    from chargetune.learning.expected_improvement import ExpectedImprovement
-    from chargetune.learning.posterior import Posterior
+    from chargetune.learning.black_box.composite import Composite
+    from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
+    from chargetune.learning.black_box.expected_improvement import ExpectedImprovement
+    from chargetune.learning.black_box.gaussian_process import GaussianProcess
+    from chargetune.learning.closed_loop.iterative_learning import Envelope
+    from chargetune.learning.initial_design import Sobol
     from chargetune.learning.safety import NoSafeThetaError, Safety
-    from chargetune.learning.sobol import Sobol
-    from chargetune.learning.surrogate import GaussianProcess
     from chargetune.learning.tuner import TrialLike, Tuner
-    from chargetune.learning.twin import Twin, Uncertain
+    from chargetune.learning.twin.posterior import Posterior
+    from chargetune.learning.twin.twin import Twin, Uncertain
     from chargetune.learning.twin_tuner import TwinTuner
 
 __all__ = [
@@ -26,10 +26,21 @@ __all__ = [
 ]  # fmt: skip
 
 _MODULES = {
-    "Composite": "composite", "ConstrainedLogEI": "constrained", "Envelope": "envelope", "ExpectedImprovement": "expected_improvement",
-    "GaussianProcess": "surrogate", "NoSafeThetaError": "safety", "Posterior": "posterior", "Safety": "safety", "Sobol": "sobol",
-    "TrialLike": "tuner", "Tuner": "tuner", "Twin": "twin", "TwinTuner": "twin_tuner", "Uncertain": "twin",
-}  # fmt: skip
+    "Composite": "black_box.composite",
+    "ConstrainedLogEI": "black_box.constrained_ei",
+    "Envelope": "closed_loop.iterative_learning",
+    "ExpectedImprovement": "black_box.expected_improvement",
+    "GaussianProcess": "black_box.gaussian_process",
+    "NoSafeThetaError": "safety",
+    "Posterior": "twin.posterior",
+    "Safety": "safety",
+    "Sobol": "initial_design",
+    "TrialLike": "tuner",
+    "Tuner": "tuner",
+    "Twin": "twin.twin",
+    "TwinTuner": "twin_tuner",
+    "Uncertain": "twin.twin",
+}
 
 
 def __getattr__(name: str) -> Any:

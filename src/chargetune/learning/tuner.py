@@ -7,12 +7,11 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from chargetune.episode.score import Score
-from chargetune.model.parameters import ParameterSpace
+from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["TrialLike", "Tuner", "check_count", "initial_design", "sobol_points"]
+__all__ = ["TrialLike", "Tuner", "check_count"]
 
 
 class TrialLike(Protocol):
@@ -43,23 +42,3 @@ def check_count(n: int) -> None:
     """ValueError unless n is a whole number of at least 1."""
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise ValueError(f"n = {n!r}, allowed is an integer >= 1")
-
-
-def sobol_points(dimension: int, seed: int, first: int, n: int) -> NDArray[np.float64]:
-    """Points ``first`` .. ``first + n - 1`` of the scrambled Sobol sequence in the unit cube, shape (n, d)."""
-    sequence = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed))
-    # Drawn up to the next power of two, which is how a Sobol sequence is balanced, and cut.
-    points: NDArray[np.float64] = sequence.random_base2((first + n - 1).bit_length())
-    return points[first : first + n]
-
-
-def initial_design(space: ParameterSpace, n_initial: int, seed: int, told: int, n: int) -> NDArray[np.float64]:
-    """The entries ``told`` .. of D_0 that are left, at most n: theta_0, then ``n_initial`` Sobol points; shape (<= n, d)."""
-    count = max(0, min(n, 1 + n_initial - told))
-    if count == 0:
-        return np.empty((0, space.dimension))
-    points = [space.default] if told == 0 else []
-    first = max(told - 1, 0)
-    if count > len(points):
-        points.extend(space.from_unit(sobol_points(space.dimension, seed, first, count - len(points))))
-    return np.array(points)

@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from chargetune.learning.ask import Ask
-from chargetune.learning.belief import TwinLoop, believe
-from chargetune.learning.constrained import ConstrainedLogEI
-from chargetune.learning.corrected import Candidate
-from chargetune.learning.safe_ask import SURE, SURE_UNPROVED, SafeAsk
+from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
+from chargetune.learning.candidate_choice import Candidate
+from chargetune.learning.candidates import Ask
+from chargetune.learning.closed_loop.search import Search
+from chargetune.learning.initial_design import initial_design, sobol_points
+from chargetune.learning.safe_mode import SURE, SURE_UNPROVED, SafeAsk
 from chargetune.learning.safety import Safety
-from chargetune.learning.tuner import TrialLike, check_count, initial_design, sobol_points
-from chargetune.learning.twin_search import Search
-from chargetune.model.parameters import ParameterSpace
+from chargetune.learning.tuner import TrialLike, check_count
+from chargetune.learning.twin.ensemble import believe
+from chargetune.learning.twin.twin_loop import TwinLoop
+from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["TwinTuner", "cautious"]
 

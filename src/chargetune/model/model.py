@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.model.split import split
+from chargetune.runtime.split import split
 
 __all__ = ["Model", "Named", "Signal"]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 
-from chargetune.battery.charging import ChargingProblem
-from chargetune.report.convergence import worst_excess
-from chargetune.report.reading import StudyView
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.report.figures.convergence import worst_excess
+from chargetune.report.study_view import StudyView
 from chargetune.study.trial import Trial
 
 __all__ = ["STEP", "Sensitivity", "again", "finite_differences", "rank_correlations"]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.episode.score import Score
-from chargetune.study.document import score_to_json
-from chargetune.study.trace import Traceable, encode
+from chargetune.study.serialization import score_to_json
+from chargetune.study.store.trace import Traceable, encode
 
 __all__ = ["Evaluate", "Outcome", "evaluate_trial", "trial_seed"]
 

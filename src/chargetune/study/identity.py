@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from chargetune.model.parameters import ParameterSpace
-from chargetune.study.document import canonical_json, describe, differences, space_to_json
-from chargetune.study.records import StudyRecord
+from chargetune.model.parameter_space import ParameterSpace
+from chargetune.study.serialization import canonical_json, describe, differences, space_to_json
+from chargetune.study.store.rows import StudyRecord
 
 __all__ = ["StudyError", "check_change", "parameters_of", "study_identity"]
 

@@ -8,9 +8,9 @@ from enum import StrEnum
 from typing import Any
 
 from chargetune.episode.score import Score, in_tolerances
-from chargetune.study.document import canonical_json, sha256
-from chargetune.study.records import StudyRecord
-from chargetune.study.store import Store
+from chargetune.study.serialization import canonical_json, sha256
+from chargetune.study.store.rows import StudyRecord
+from chargetune.study.store.store import Store
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 
 __all__ = ["Reason", "StudyResult", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]

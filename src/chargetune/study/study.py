@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.model.parameters import ParameterSpace
-from chargetune.study.database import Hold
-from chargetune.study.document import canonical_json, score_to_json, sha256
-from chargetune.study.earlier import Earlier, read_earlier
+from chargetune.model.parameter_space import ParameterSpace
+from chargetune.study.dataframe import study_html, trials_dataframe
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
-from chargetune.study.notebook import study_html, trials_dataframe
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.records import ResultRecord, result_of
 from chargetune.study.result import StudyResult, by_performance, made_from, read_result, with_belief
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
-from chargetune.study.store import Store, StudyRecord
-from chargetune.study.trace import Traceable, encode
+from chargetune.study.serialization import canonical_json, score_to_json, sha256
+from chargetune.study.store.database import Hold
+from chargetune.study.store.rows import ResultRecord, result_of
+from chargetune.study.store.store import Store, StudyRecord
+from chargetune.study.store.trace import Traceable, encode
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
+from chargetune.study.warm_start import Earlier, read_earlier
 
 __all__ = ["Proposer", "Study", "StudyError", "WorkerError"]
 

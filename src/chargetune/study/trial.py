@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from chargetune.episode.notebook import facts
+from chargetune.episode.html_repr import facts
 from chargetune.episode.score import Score
 
 __all__ = ["Trial", "TrialStatus", "best_feasible", "best_performance"]

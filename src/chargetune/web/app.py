@@ -18,11 +18,11 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from chargetune.report.markup import plotly_js, static
-from chargetune.report.panels import trial_drawing
-from chargetune.report.reading import Reading, StudyView
-from chargetune.report.rows import theta_document, trace_csv
-from chargetune.study.store import StoreError
+from chargetune.report.page.html import plotly_js, static
+from chargetune.report.page.plot_data import trial_drawing
+from chargetune.report.page.trial_rows import theta_document, trace_csv
+from chargetune.report.study_view import Reading, StudyView
+from chargetune.study.store.store import StoreError
 from chargetune.study.trial import Trial
 from chargetune.web.events import Ending, list_events, study_events
 from chargetune.web.guard import Guard

@@ -7,9 +7,9 @@ import json
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
-from chargetune.report.reading import StudyView
-from chargetune.report.rows import study_head, study_summary, trial_rows
-from chargetune.study.store import StoreError
+from chargetune.report.page.trial_rows import study_head, study_summary, trial_rows
+from chargetune.report.study_view import StudyView
+from chargetune.study.store.store import StoreError
 from chargetune.web.watch import StoreWatch
 
 __all__ = ["Ending", "list_events", "study_events"]

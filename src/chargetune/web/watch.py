@@ -6,8 +6,8 @@ import os
 import threading
 from dataclasses import dataclass, field
 
-from chargetune.report.reading import StudyView, read_studies
-from chargetune.study.database import database_at
+from chargetune.report.study_view import StudyView, read_studies
+from chargetune.study.store.database import database_at
 
 __all__ = ["StoreWatch"]
 

@@ -1,0 +1,1 @@
+"""What charging controllers are compared with: charging protocols, and the comparison itself."""

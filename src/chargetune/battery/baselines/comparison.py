@@ -1,0 +1,147 @@
+"""The tuned controller beside what people do today, on the same plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, Law, charge, constant_current, four_step, multi_step
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.plants.steppable import triable
+from chargetune.episode.episode import Ending, Episode
+from chargetune.episode.score import Score
+
+__all__ = ["Row", "compare", "row_names"]
+
+# Shares of the largest current: of CC-CV, and of five steps in five equal SOC windows.
+CCCV_SHARES = (0.25, 0.5, 1.0)
+STEP_SHARES = (1.0, 2.5 / 3, 2 / 3, 0.5, 1 / 3)
+# The best constant backoff is found to this, V.
+BACKOFF_TOLERANCE_V = 5e-4
+BACKOFF_MAX_V = 0.3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way of charging: its episode without sensor noise, and the verdict on that. No score where it did not come to its end."""
+
+    name: str
+    episode: Episode
+    score: Score | None
+    noise: Mapping[str, float]
+
+    @property
+    def worst_excess(self) -> dict[str, float | None]:
+        """voltage_mV, anode_mV, temperature_K: the worst signed excess of each limit that is set, else None."""
+        found = self.score.excess if self.score else {}
+        scaled = {"voltage_mV": ("voltage_max_V", 1e3), "anode_mV": ("anode_min_V", 1e3), "temperature_K": ("temperature_max_K", 1.0)}
+        return {key: factor * found[name] if name in found else None for key, (name, factor) in scaled.items()}
+
+    @property
+    def breaks_limit(self) -> bool:
+        """Whether a limit was broken by more than its tolerance and noise, or the charge did not come to its end.
+
+        Noise is one standard deviation of the sensor: a controller that was tuned on noisy measurements knows no better.
+        """
+        if self.score is None:
+            return True
+        return any(value > self.score.tolerance[name] + self.noise.get(name, 0.0) for name, value in self.score.excess.items())
+
+
+def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
+    """What can be compared on this plant, in the order of the table."""
+    largest = problem.current_max_A or 0.0
+    names = [f"CC-CV {share * largest:.3g} A" for share in CCCV_SHARES]
+    names += ["multi-step CC", "four-step CC (Attia)", "plant oracle"]
+    if triable(problem.plant) is None:
+        names = []
+    names += ["nominal MPC", "best constant backoff"]
+    if problem.plant_model is None:
+        names.append("MPC with the true model")
+    return [*names, *(["tuned"] if theta is not None else [])]
+
+
+def compare(
+    problem: ChargingProblem, theta: Sequence[float] | None = None, *, seed: int = 0, executor: Executor | None = None
+) -> Iterator[Row]:
+    """Run every row of `row_names`, in the order in which they are done.
+
+    CC-CV, step charging and the oracle keep their limits exactly, without sensors: CC-CV and the steps the voltage, the
+    oracle every limit. Controllers see the problem's sensors with noise of ``seed``; all are judged without noise.
+    """
+    names = row_names(problem, theta)
+    if executor is None:
+        yield from (_row(problem, name, theta, seed) for name in names)
+        return
+    tasks: list[Future[Row]] = [executor.submit(_row, problem, name, theta, seed) for name in names]
+    yield from (task.result() for task in as_completed(tasks))
+
+
+def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, seed: int) -> Row:
+    largest = problem.current_max_A or 0.0
+    voltage = problem.limits[:1]
+    if name.startswith("CC-CV"):
+        share = CCCV_SHARES[row_names(problem, theta).index(name)]
+        return _stepped(problem, name, constant_current(share * largest), voltage)
+    plain = replace(problem, backoff=None, ratios=(), limit_backoffs=(), current_limit=None, voltage_spread=None)
+    table: dict[str, Callable[[], Row]] = {
+        "multi-step CC": lambda: _stepped(problem, name, multi_step([s * largest for s in STEP_SHARES]), voltage),
+        "four-step CC (Attia)": lambda: _stepped(
+            problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.plant_cell.capacity_Ah)), voltage
+        ),
+        "plant oracle": lambda: _stepped(problem, name, constant_current(largest), problem.limits),
+        "nominal MPC": lambda: _judged(problem, name, problem.episode(problem.space.default, seed)),
+        "best constant backoff": lambda: _best_backoff(plain, name, seed),
+        "MPC with the true model": lambda: _judged(plain, name, replace(plain, mismatch_seed=None).episode(None, seed)),
+        "tuned": lambda: _judged(problem, name, problem.episode(theta, seed)),
+    }
+    return table[name]()
+
+
+def _stepped(problem: ChargingProblem, name: str, law: Law, limits: Sequence[object]) -> Row:
+    stepped = triable(problem.plant)
+    if stepped is None:
+        raise ValueError(f"{name}: the next interval of this plant cannot be tried")
+    episode = charge(
+        stepped,
+        law,
+        limits,  # type: ignore[arg-type]
+        steps=problem.steps,
+        soc_target=problem.soc_target,
+        current_max_A=problem.current_max_A or 0.0,
+    )
+    return _judged(problem, name, episode)
+
+
+def _judged(problem: ChargingProblem, name: str, episode: Episode) -> Row:
+    true = episode.noise_free()
+    exact = replace(problem, verdict_samples=1)
+    noise = {limit.name: problem.sensors.noise_sd.get(limit.signal, 0.0) for limit in problem.limits}
+    return Row(name, true, exact.score(true) if true.ending is Ending.DONE else None, noise)
+
+
+def _best_backoff(plain: ChargingProblem, name: str, seed: int) -> Row:
+    """The smallest constant voltage backoff with which no limit is broken, by bisection; the largest when none does it."""
+    cell, highest = plain.plant_cell, plain.voltage_max_V or 0.0
+    room = highest - float(np.interp(plain.soc_start, cell.ocv_soc, cell.ocv_V))
+    largest = min(BACKOFF_MAX_V, 0.9 * room)
+    tuned = replace(plain, backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest))
+
+    def run(value: float) -> Row:
+        return _judged(plain, name, tuned.episode([value, value], seed))
+
+    low, high, best = 0.0, largest, run(largest)
+    if best.breaks_limit:
+        return best
+    none = run(0.0)
+    if not none.breaks_limit:
+        return none
+    while high - low > BACKOFF_TOLERANCE_V:
+        middle = (low + high) / 2
+        row = run(middle)
+        low, high, best = (middle, high, best) if row.breaks_limit else (low, middle, row)
+    return best

@@ -1,0 +1,1 @@
+"""A cell as data, and the models made of it: equivalent circuit, temperature, lithium plating."""

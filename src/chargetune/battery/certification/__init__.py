@@ -1,0 +1,1 @@
+"""How probable a violation is, by fresh episodes on plants that differ."""

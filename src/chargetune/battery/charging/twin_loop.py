@@ -1,0 +1,169 @@
+"""The twin of a charging problem: the controller's own circuit with unknown resistances and capacitances as plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
+from chargetune.battery.charging.problem import ChargingProblem, NotMeasuredError, stand_in
+from chargetune.control.controller import Controller
+from chargetune.episode.compiled import CompiledEpisode, compiled_episode
+from chargetune.episode.episode import Ending, Episode
+from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.score import Score
+from chargetune.model.model import Model
+from chargetune.plants.simulated import SimulatedPlant
+
+if TYPE_CHECKING:
+    from chargetune.learning.twin.discrepancy import OutputError
+    from chargetune.learning.twin.twin import Twin
+    from chargetune.learning.twin.twin_loop import Case
+
+__all__ = ["ChargingTwin"]
+
+# A sensor without stated noise is trusted to this.
+LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e-3}
+# A circuit's prediction is off by at least about this where it was not measured.
+LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
+# Of the variance of that error, what an identified OCV leaves without current.
+OCV_SHARE = 1.0
+# Plants that are remembered: those that thetas are chosen by, and those that the chosen one is judged by.
+PLANTS_KEPT = 256
+# Windows of the SOC in which a predicted excess is told to the search.
+WINDOWS = 24
+
+
+@dataclass(frozen=True)
+class ChargingTwin:
+    """Closed loops of ``problem`` on circuits whose R and C tables are the controller's own times exp(m).
+
+    ``spread`` is the prior standard deviation of m, ``smooth`` the correlation of neighbouring SOC nodes. The prior knows
+    nothing of the plant: it is centred on what the controller believes. ``capacity_spread`` (relative), ``soc_spread`` and
+    ``ocv_spread_V`` are those of the capacity, of the SOC at the start and of a constant error of the OCV, 0 where these are known.
+    Where that error is stated the OCV is taken as known but for it.
+    """
+
+    problem: ChargingProblem
+    spread: float = 0.4
+    smooth: float = 0.3
+    capacity_spread: float = 0.0
+    soc_spread: float = 0.0
+    ocv_spread_V: float = 0.0
+
+    @cached_property
+    def twin(self) -> Twin:
+        """Unknown tables over SOC; measured voltage, temperature and limited anode potential where the cell has them."""
+        from chargetune.learning.twin.twin import Twin, Uncertain
+
+        problem = self.problem
+        belief = problem.controller_cell
+        model = self._circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
+        anode = belief.anode is not None and problem.anode_min_V is not None
+        names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
+        noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
+        unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
+        unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
+        unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
+        unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
+        error = {name: LEAST_ERROR[name] for name in names}
+        # Of the cell's own circuit the OCV is known, and but for an unknown that is its error. Else it was identified, worst near full.
+        at_rest = OCV_SHARE if problem.plant_model and not self.ocv_spread_V else 0.0
+        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
+
+    @cached_property
+    def _circuit(self) -> Model:
+        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s)
+
+    @property
+    def features(self) -> Mapping[str, tuple[float, float]]:
+        """What the circuit's error depends on: SOC, current and, where it is measured, temperature."""
+        problem = self.problem
+        ranges = {"soc": (0.0, 1.0), "current_A": (problem.current_min_A, problem.current_max_A or 0.0)}
+        thermal = problem.controller_cell.thermal
+        if thermal:
+            ranges["temperature_K"] = (thermal.ambient_K, (problem.temperature_max_K or thermal.ambient_K + 30.0) + 5.0)
+        return ranges
+
+    @property
+    def controller(self) -> Controller:
+        return self.problem.controller
+
+    def measured_rows(self, episode: Episode) -> NDArray[np.float64]:
+        return self.problem.measured_rows(episode)
+
+    @property
+    def row_tolerances(self) -> NDArray[np.float64]:
+        return self.problem.row_tolerances
+
+    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+        """Charges without noise, with the third of each case added to what is measured and so to what the estimator reads."""
+        thetas, plants = [theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases]
+        episodes = self._loop.run_each(thetas, plants, tables=[self._table(unknowns, error) for _, unknowns, error in cases])
+        return [episode if episode.ending is Ending.DONE else None for episode in episodes]
+
+    def _table(self, unknowns: NDArray[np.float64], error: OutputError | None) -> NDArray[np.float64]:
+        """The error and the constants of the unknowns, both of what is measured, on `_lattice`."""
+        biases = self.twin.biases(unknowns)
+        constants = np.array([biases.get(name, 0.0) for name in self._lattice.outputs])[:, None]
+        return np.tile(constants, self._lattice.size) if error is None else error.table + constants
+
+    @cached_property
+    def _lattice(self) -> Lattice:
+        return Lattice.over(self.features, list(self.twin.noise_sd))
+
+    def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
+        # An ensemble goes through many thetas: its plants are made once.
+        key = unknowns.tobytes()
+        if key not in self._plants:
+            while len(self._plants) >= PLANTS_KEPT:
+                self._plants.pop(next(iter(self._plants)))
+            self._plants[key] = self._made(unknowns)
+        return self._plants[key]
+
+    @cached_property
+    def _plants(self) -> dict[bytes, SimulatedPlant]:
+        return {}
+
+    def _made(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
+        sizes, own = self.twin.model.parameter_blocks, self._loop.plant
+        values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
+        start = dict(zip(own.model.state_names, (float(v) for v in self.twin.start_state(unknowns)), strict=True))
+        return replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
+
+    def violation(self, episode: Episode) -> float:
+        """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""
+        return self.problem.violation_mVs(episode)
+
+    def score(self, episode: Episode) -> Score | None:
+        """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
+        try:
+            return self._exact.score(episode, metrics=False)
+        except NotMeasuredError:
+            return None
+
+    def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        return self._exact.samples(episode)
+
+    @cached_property
+    def _exact(self) -> ChargingProblem:
+        return replace(stand_in(self.problem), soc_windows=WINDOWS)
+
+    @property
+    def unpredicted(self) -> tuple[str, ...]:
+        """Limits of the problem that the circuit does not predict: nothing is known of them before they are tried."""
+        known = {limit.name for limit in self._exact.limits}
+        return tuple(limit.name for limit in self.problem.limits if limit.name not in known)
+
+    @cached_property
+    def _loop(self) -> CompiledEpisode:
+        problem = self._exact
+        plant = problem.plant
+        if not isinstance(plant, SimulatedPlant):
+            raise TypeError("the twin's plant is a simulated circuit")
+        return compiled_episode(self.problem.controller, replace(plant, model=self._circuit), problem.steps, lattice=self._lattice)

@@ -1,0 +1,1 @@
+"""From a cycler's records to a cell: files, pulses, fits."""

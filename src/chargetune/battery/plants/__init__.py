@@ -1,0 +1,1 @@
+"""Plants of charging studies beside the cell's own circuit."""

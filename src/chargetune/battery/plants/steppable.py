@@ -1,0 +1,68 @@
+"""Plants whose next interval can be tried with any current."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.plants.electrochemical import ElectrochemicalPlant
+from chargetune.model.model import Signal
+from chargetune.plants.plant import Plant
+from chargetune.plants.simulated import SimulatedPlant
+
+__all__ = ["Stepped", "triable"]
+
+
+class Stepped(Protocol):
+    """A plant whose next interval can be tried with any current from any state it was in."""
+
+    @property
+    def outputs(self) -> tuple[Signal, ...]: ...
+
+    @property
+    def sampling_time_s(self) -> float: ...
+
+    @property
+    def start(self) -> Any:
+        """The state at rest before the first interval."""
+        ...
+
+    def ahead(self, state: Any, current_A: float) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
+        """(true outputs at the start, at the end, state at the end) of one interval."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Circuit:
+    """A simulated plant without its sensors and its process noise."""
+
+    plant: SimulatedPlant
+
+    @property
+    def outputs(self) -> tuple[Signal, ...]:
+        return self.plant.outputs
+
+    @property
+    def sampling_time_s(self) -> float:
+        return self.plant.sampling_time_s
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        return self.plant.start_state
+
+    def ahead(self, state: Any, current_A: float) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
+        model = self.plant.model
+        p = model.nominal
+        following = np.array(model.f(state, current_A, p)).ravel()
+        first, last = (np.array(model.h(x, current_A, p)).ravel() for x in (state, following))
+        return first, last, following
+
+
+def triable(plant: Plant) -> Stepped | None:
+    """The plant as one whose next interval can be tried; None when it cannot (an instrument)."""
+    if isinstance(plant, SimulatedPlant):
+        return _Circuit(plant)
+    return plant if isinstance(plant, ElectrochemicalPlant) else None

@@ -1,0 +1,1 @@
+"""Charging studies: their file, how they are opened, campaigns, export."""

@@ -1,0 +1,84 @@
+"""From a study file to a study in a store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.soc_windows import ChargingWindows
+from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.studies.study_file import Config, SafetyTable, TunerName, TwinTable
+from chargetune.study.store.store import Store
+from chargetune.study.study import Proposer, Study
+
+__all__ = ["make_tuner", "open_study"]
+
+
+def make_tuner(
+    name: TunerName,
+    seed: int,
+    problem: ChargingProblem,
+    safety: SafetyTable | None = None,
+    start: NDArray[np.float64] | None = None,
+    unknown: TwinTable | None = None,
+) -> Proposer:
+    """The tuner that a configuration names; the twin simulates the problem's controller.
+
+    Raises ValueError when it is to be safe and cannot.
+    """
+    if safety and name != "twin":
+        raise ValueError(f"[safety] is given with tuner = {name!r}, allowed is tuner = 'twin': it alone predicts what it has not tried")
+    if unknown and name != "twin":
+        raise ValueError(f"[twin] is given with tuner = {name!r}, allowed is tuner = 'twin': the others have no model of the plant")
+    # torch is needed from here on only.
+    from chargetune import learning
+
+    known = unknown or TwinTable()
+    twin = ChargingTwin(
+        problem,
+        spread=known.resistance_spread,
+        capacity_spread=known.capacity_spread,
+        soc_spread=known.soc_spread,
+        ocv_spread_V=known.ocv_spread_V,
+    )
+    if safety and twin.unpredicted:
+        raise ValueError(
+            f"[safety] is given with the limits {', '.join(twin.unpredicted)}, which the cell's circuit does not predict: "
+            "allowed are limits whose table ([thermal], [anode]) the cell file has"
+        )
+    first = None if start is None else tuple(float(v) for v in start)
+    safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
+    makers: dict[str, Callable[[int], Proposer]] = {
+        "default": lambda s: learning.ConstrainedLogEI(seed=s),
+        "ei": lambda s: learning.ExpectedImprovement(seed=s),
+        "sobol": lambda s: learning.Sobol(seed=s),
+        "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
+        "envelope": lambda _: learning.Envelope(twin),
+        "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
+    }
+    return makers[name](seed)
+
+
+def open_study(store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False) -> Study:
+    """The study of a configuration, begun or resumed; see `Study.create_or_resume`."""
+    if config.safety and config.study.earlier:
+        raise ValueError(
+            "[safety] is given with [[study.earlier]]: the trials of an earlier study may be of another cell, and what that one allowed "
+            "is not known to be safe for this one; allowed is one of the two"
+        )
+    problem = config.problem(folder)
+    return Study.create_or_resume(
+        store,
+        config.study.name,
+        config=config.document(folder),
+        space=problem.space,
+        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem), config.twin),
+        seed=config.study.seed,
+        batch=config.study.batch,
+        earlier=config.earlier(folder),
+        accept_changed=accept_changed,
+    )

@@ -1,0 +1,179 @@
+"""What can be seen to be wrong with a controller without running it: signs, start, horizon."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chargetune.checks.finding import Evidence, Finding
+from chargetune.control.control_step import problem_of
+from chargetune.control.controller import Controller, Limit
+from chargetune.model.model import Model
+
+__all__ = ["check_horizon", "check_signs", "check_start", "model_at", "noticeable", "row_values"]
+
+# A violation below this share of a limit's scale is the solver's tolerance, with some room.
+NOTICEABLE = 1e-2
+# A horizon that spans less than this share of a time constant hardly sees the dynamics.
+SEEN = 1 / 2
+# |ln lambda| of an eigenvalue that integrates, and of one whose mode is over within an interval.
+INTEGRATES, OVER = 1e-6, 3.0
+# States and inputs at which a model is linearised, at most.
+POINTS = 40
+
+
+def model_at(controller: Controller, theta: ArrayLike | None = None) -> Model:
+    """The controller's model with the parameters it has at theta (None: untuned)."""
+    model = controller.model
+    values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal)).ravel()
+    named, first = {}, 0
+    for name, size in model.parameter_blocks.items():
+        named[name] = values[first : first + size]
+        first += size
+    return model.with_parameters(**named)
+
+
+def row_values(
+    controller: Controller,
+    limit: int,
+    x: NDArray[np.float64],
+    u: NDArray[np.float64],
+    theta: ArrayLike | None = None,
+    now: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """The largest row of a limit (positive: beyond it, in its unit) at states (K, nx) and inputs (K, nu), shape (K,).
+
+    ``now`` (K, nx) are the states at which the controller solved, by default x.
+    """
+    values, count = controller.theta_vector(theta), len(x)
+    p = controller.parameters(values, controller.model.nominal)
+    fixed = (ca.repmat(ca.DM(values), 1, count), ca.repmat(p, 1, count))
+    rows = controller.limits[limit].rows.map(count)(x.T, u.T, *fixed, (x if now is None else now).T)
+    return np.asarray(np.max(np.array(rows), axis=0), dtype=np.float64)
+
+
+def noticeable(limit: Limit) -> float:
+    """The violation of a limit that a check begins to speak of, in its unit."""
+    return NOTICEABLE * limit.scale
+
+
+def check_signs(
+    controller: Controller,
+    expected: Mapping[tuple[str, str], int],
+    states: NDArray[np.float64],
+    inputs: NDArray[np.float64],
+    theta: ArrayLike | None = None,
+) -> tuple[Finding, ...]:
+    """Outputs of the model that react to an input in the wrong direction.
+
+    ``expected`` maps (output, input) to +1 or -1, the sign of d h(f(x, u), u) / du; ``states`` (K, nx) and ``inputs``
+    (K, nu) are where it is looked at.
+    """
+    model = model_at(controller, theta)
+    x, u, p = (ca.SX.sym(n, k) for n, k in (("x", len(model.states)), ("u", len(model.inputs)), ("p", model.nominal.size)))
+    slope = ca.Function("slope", [x, u, p], [ca.jacobian(model.h(model.f(x, u, p), u, p), u)])
+    points = _points(len(inputs))
+    slopes = np.array([np.array(slope(states[k], inputs[k], model.nominal)) for k in points])
+    out = []
+    for (output, name), sign in expected.items():
+        values = slopes[:, model.output_names.index(output), model.input_names.index(name)]
+        wrong = float(np.mean(sign * values <= 0))
+        if wrong:
+            words = ("falls", "rise") if sign > 0 else ("rises", "fall")
+            out.append(
+                Finding(
+                    "wrong-sign",
+                    "error",
+                    f"{output} {words[0]} when {name} is raised ({100 * wrong:.0f} % of the states looked at); it has to {words[1]}",
+                    f"the sign of {name} or of a term of {output} in the model is wrong: current is positive when it charges, "
+                    "V = OCV + U1 + R0 I",
+                    {"share_wrong": wrong, "slope_mean": float(np.mean(values)), "expected_sign": float(sign)},
+                    Evidence("state looked at", f"d {output} / d {name}", {"model": (points.astype(float), values)}, {"zero": 0.0}),
+                )
+            )
+    return tuple(out)
+
+
+def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple[Finding, ...]:
+    """Limits that every admissible input breaks at the start state."""
+    values = controller.theta_vector(theta)
+    problem, nu = problem_of(controller), len(controller.model.inputs)
+    start = np.array(controller.start)
+    q = problem.prepare(values, controller.setpoint, controller.model.nominal)
+    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(start, q))
+    each = [sorted({low, high, float(np.clip(0.0, low, high))}) for low, high in zip(lower, upper, strict=True)]
+    choices = np.array(list(itertools.product(*each)))
+    out = []
+    for j, limit in enumerate(controller.limits):
+        if limit.at == "terminal":
+            continue
+        # A state's row at the start is given, whatever `at` says; an output's depends on the input.
+        excess = row_values(controller, j, np.tile(start, (len(choices), 1)), choices, values)
+        least = float(np.min(excess))
+        if least > noticeable(limit):
+            out.append(
+                Finding(
+                    "unsafe-start",
+                    "error",
+                    f"{limit.of} is beyond its limit by {least:.4g} at the start, whatever the input",
+                    f"start elsewhere, move the limit of {limit.of}, or allow an input that keeps it",
+                    {"least_excess": least},
+                    Evidence("input tried", f"{limit.of} beyond its limit", {"start": (choices[:, 0], excess)}, {"limit": 0.0}),
+                )
+            )
+    return tuple(out)
+
+
+def check_horizon(
+    controller: Controller, states: NDArray[np.float64], inputs: NDArray[np.float64], theta: ArrayLike | None = None
+) -> tuple[Finding, ...]:
+    """A horizon so short that the model's dynamics cannot matter.
+
+    The time constants are Ts / |ln lambda| for the eigenvalues lambda of df/dx that neither integrate (1) nor
+    are over within an interval (near 0); the fastest of them, in the median over the points, has to be seen.
+    """
+    model = model_at(controller, theta)
+    x, u, p = (ca.SX.sym(n, k) for n, k in (("x", len(model.states)), ("u", len(model.inputs)), ("p", model.nominal.size)))
+    transition = ca.Function("A", [x, u, p], [ca.jacobian(model.f(x, u, p), x)])
+    step, points, fastest = model.sampling_time_s, _points(len(inputs)), []
+    for k in points:
+        slopes = np.array(transition(states[k], inputs[k], model.nominal))
+        # Outside of the model's domain nothing is known of its time constants.
+        if not np.all(np.isfinite(slopes)):
+            fastest.append(np.nan)
+            continue
+        eigenvalues = np.linalg.eigvals(slopes).astype(complex)
+        sizes = np.abs(np.log(np.where(eigenvalues == 0, 1e-12, eigenvalues)))
+        slow = sizes[(sizes > INTEGRATES) & (sizes < OVER)]
+        fastest.append(step / np.max(slow) if slow.size else np.nan)
+    constants = np.array(fastest)
+    if np.all(np.isnan(constants)):
+        return ()
+    constant, span = float(np.nanmedian(constants)), controller.horizon * step
+    if span >= SEEN * constant:
+        return ()
+    least = int(np.ceil(SEEN * constant / step))
+    return (
+        Finding(
+            "short-horizon",
+            "warning",
+            f"the horizon spans {span:.3g} s, less than half of the model's fastest time constant, {constant:.3g} s: "
+            "the controller acts almost as if the model had no dynamics",
+            f"a horizon of at least {least} intervals, or a longer sampling time",
+            {
+                "horizon_s": span,
+                "time_constant_s": constant,
+                "horizon_intervals": float(controller.horizon),
+                "least_intervals": float(least),
+            },
+            Evidence("state looked at", "time (s)", {"fastest time constant": (points.astype(float), constants)}, {"horizon": span}),
+        ),
+    )
+
+
+def _points(count: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, min(count, POINTS)).astype(np.int64))

@@ -1,0 +1,75 @@
+"""Iterative learning without a plant model: make what the controller predicts cover what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from chargetune.episode.episode import Episode
+from chargetune.learning.closed_loop.covering import (
+    covering,
+    predicted_rows,
+)
+from chargetune.learning.closed_loop.loop import EnvelopeLoop
+from chargetune.learning.tuner import TrialLike, check_count
+from chargetune.model.parameter_space import ParameterSpace
+
+__all__ = ["Envelope"]
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """Iterative learning: the theta whose predictions cover what was measured last, filtered and damped. No model of the plant.
+
+    Per sample the error of the controller's prediction, e_k - c_k at the newest trace, is smoothed (Savitzky-Golay, order 2) and
+    covered in full where it asks for caution, by the share ``relax`` where it allows more. First theta_0, or ``start``.
+    Quick, and without a promise: it does not know what it has not seen. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
+    """
+
+    loop: EnvelopeLoop
+    relax: float = 0.7
+    window: int = 21
+    start: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.relax, bool) or not 0.0 < self.relax <= 1.0:
+            raise ValueError(f"envelope: relax = {self.relax!r}, allowed is (0, 1]")
+        if isinstance(self.window, bool) or not isinstance(self.window, int) or self.window < 3:
+            raise ValueError(f"envelope: window = {self.window!r}, allowed is an integer >= 3")
+
+    def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
+        """The next theta, ``n`` times: a step needs the trial before it. Shape (n, d)."""
+        check_count(n)
+        first = space.default if self.start is None else space.validate(np.array(self.start))
+        for trial in reversed(trials):
+            reader = getattr(trial, "episode", None)
+            episode = None if reader is None else reader()
+            if episode is not None and len(episode) > 1:
+                first = self._step(np.array(trial.theta), episode)
+                break
+        return np.tile(first, (n, 1))
+
+    def _step(self, theta: NDArray[np.float64], episode: Episode) -> NDArray[np.float64]:
+        controller = self.loop.controller
+        predicted, _ = predicted_rows(controller, episode, theta)
+        error = _smooth(self.loop.measured_rows(episode) - predicted, self.window)
+        wanted = predicted + np.where(error < 0, self.relax * error, error)
+        return covering(controller, episode, theta, wanted)
+
+
+def _smooth(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Along the first axis; what is not finite stays so and is bridged."""
+    out, at = np.full_like(values, np.nan), np.arange(len(values))
+    length = min(window, len(values))
+    for index in np.ndindex(*values.shape[1:]):
+        column = values[(slice(None), *index)]
+        known = np.isfinite(column)
+        if known.any():
+            bridged = np.interp(at, at[known], column[known])
+            smooth = savgol_filter(bridged, length, 2) if length > 2 else bridged
+            out[(slice(None), *index)] = np.where(known, smooth, np.nan)
+    return out

@@ -1,0 +1,1 @@
+"""The twin: a model of the plant whose unknowns are learnt from whole traces."""

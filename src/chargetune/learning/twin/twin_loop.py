@@ -1,0 +1,56 @@
+"""What a user's closed loop offers to a tuner that learns a twin of its plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
+from chargetune.learning.closed_loop.loop import EnvelopeLoop
+from chargetune.learning.tuner import TrialLike
+from chargetune.learning.twin.discrepancy import OutputError
+from chargetune.learning.twin.twin import Twin
+
+__all__ = ["Case", "TracedTrial", "TwinLoop"]
+
+Case = tuple[NDArray[np.float64], NDArray[np.float64], OutputError | None]
+"""One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
+
+
+class TracedTrial(TrialLike, Protocol):
+    """A trial whose measured episode can be read; None when it has none."""
+
+    @property
+    def episode(self) -> Callable[[], Episode | None] | None: ...
+
+
+class TwinLoop(EnvelopeLoop, Protocol):
+    """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
+
+    @property
+    def twin(self) -> Twin: ...
+
+    @property
+    def features(self) -> Mapping[str, tuple[float, float]]:
+        """Signals of an episode, with their ranges, that the error of the twin depends on."""
+        ...
+
+    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+        """A noise-free episode of each case, None where it fails; the third of a case is added to the measured outputs."""
+        ...
+
+    def score(self, episode: Episode) -> Score | None:
+        """The verdict on an episode; None when it has none."""
+        ...
+
+    def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        """By limit of the score the excess of every sample, in its unit, and the window of its profile that it counts in, 0 without one."""
+        ...
+
+    def violation(self, episode: Episode) -> float:
+        """What a measured episode spent of a budget of violation: excess beyond the tolerance, over time, >= 0."""
+        ...

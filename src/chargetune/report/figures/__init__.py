@@ -1,0 +1,1 @@
+"""Figures of studies, checks, comparisons and certificates."""

@@ -1,0 +1,220 @@
+"""The sections of a report that are text and tables."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+
+from chargetune.report.limit_recheck import Check, recheck
+from chargetune.report.page.html import Cell, paragraph, section, table
+from chargetune.report.page.trial_rows import study_head
+from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
+from chargetune.report.study_view import StudyView
+from chargetune.study.store.database import store_name
+from chargetune.study.trial import Trial, TrialStatus
+
+__all__ = ["failures", "limits", "opening", "provenance", "result", "sensitivities", "violations", "what_was_tuned"]
+
+
+def opening(view: StudyView) -> str:
+    done = [t for t in view.trials if t.score is not None]
+    broke = sum(not t.feasible for t in done)
+    failed = sum(t.status is TrialStatus.FAILED for t in view.trials)
+    running = sum(t.status is TrialStatus.RUNNING for t in view.trials)
+    counts = f"{len(view.trials)} trials: {len(done) - broke} within the limits, {broke} beyond one, {failed} failed"
+    more = f", {running} not told yet" if running else ""
+    best = view.tuned
+    if best is None:
+        verdict = paragraph("No trial has a score: there is no result.", "bad")
+    elif not best.feasible:
+        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits: {view.result.sentence}.", "bad")
+    else:
+        why = f"Why this one: {view.result.sentence}."
+        verdict = paragraph(f"Result: trial {best.number}, which kept every limit. {_minutes(view)} {why}", "good")
+    note = '<p id="drawing">The figures are being drawn.</p>\n<noscript><p class="bad">The figures need JavaScript.</p></noscript>\n'
+    return f"<header>\n<h1>{escape(view.name)}</h1>\n{paragraph(counts + more + '.', 'faint')}{verdict}{note}</header>\n<main>\n"
+
+
+def _minutes(view: StudyView) -> str:
+    def t95(trial: Trial | None) -> float | None:
+        return None if trial is None or trial.score is None else trial.score.metrics.get("t95_min")
+
+    tuned, untuned = t95(view.tuned), t95(view.untuned)
+    if tuned is None:
+        end = None if view.tuned is None or view.tuned.score is None else view.tuned.score.metrics.get("soc_end")
+        return "" if end is None else f"The charge ended at a state of charge of {100 * end:.1f} %."
+    kept = "kept the limits" if view.untuned is not None and view.untuned.feasible else "broke a limit"
+    before = "" if untuned is None else f" Untuned it took {untuned:.2f} min and {kept}."
+    return f"95 % state of charge after {tuned:.2f} min.{before}"
+
+
+def what_was_tuned(view: StudyView) -> str:
+    problem, head = view.problem, study_head(view)
+    parts = []
+    if problem is not None:
+        plant = "its own circuit, simulated" if problem.plant_model is None else repr(problem.plant_model)
+        belief = "the plant's own" if problem.mismatch_seed is None else f"wrong by the factors of mismatch seed {problem.mismatch_seed}"
+        facts = [
+            ("cell", problem.plant_cell.name),
+            ("capacity", f"{problem.plant_cell.capacity_Ah:g} Ah"),
+            ("plant", plant),
+            ("controller's parameters", belief),
+            ("sampling time, horizon", f"{problem.sampling_time_s:g} s, {problem.horizon} intervals"),
+            (
+                "charge",
+                f"SOC {problem.soc_start:g} to {problem.soc_target:g}, at most {problem.steps * problem.sampling_time_s / 60:g} min",
+            ),
+            ("tuner", view.tuner),
+        ]
+        parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts]))
+        if problem.plant_cell.remark:
+            parts.append(paragraph(f"{problem.plant_cell.name}: {problem.plant_cell.remark}", "faint"))
+        rows = [(x["name"], float(x["bound"]), x["unit"], float(x["tolerance"]), x["kind"]) for x in head["limits"]]
+        parts.append(table(("limit", "bound", "unit", "tolerance", "in the controller"), rows))
+    else:
+        parts.append(
+            paragraph("The study is not one of battery charging. What an evaluation does is in its configuration, under Provenance.")
+        )
+    return section("What was tuned", *parts)
+
+
+def result(view: StudyView) -> str:
+    best, untuned = view.tuned, view.untuned
+    if best is None:
+        return ""
+    rows: list[tuple[Cell, ...]] = []
+    for x, value in zip(study_head(view)["theta"], best.theta, strict=True):
+        span = x["upper"] - x["lower"]
+        at = "at its bound" if min(value - x["lower"], x["upper"] - value) <= 1e-6 * span else ""
+        rows.append((x["entry"], value, x["untuned"], "" if x["unit"] == "1" else x["unit"], x["lower"], x["upper"], at))
+    headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower bound", "upper bound", "")
+    names = dict.fromkeys(name for t in (untuned, best) if t is not None and t.score is not None for name in t.score.metrics)
+    figures = [
+        (name, *(t.score.metrics.get(name) if t is not None and t.score is not None else None for t in (untuned, best))) for name in names
+    ]
+    what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
+    return section(what, table(headings, rows), table(("figure of merit", "untuned", f"trial {best.number}"), figures))
+
+
+def limits(view: StudyView) -> str:
+    title = "Limits, checked again from the stored traces"
+    if view.problem is None:
+        stored = [(name, e, t) for name, e, t in _stored(view.tuned)]
+        text = "What the limits mean is not in the study's document, so they cannot be judged again. The stored excess of the result:"
+        return section(title, paragraph(text), table(("limit", "excess", "tolerance"), stored))
+    checks, damaged = {}, []
+    for reading in view.readings(t for t in view.trials if t.trace_sha256 is not None):
+        if reading.episode is None:
+            damaged.append(reading.message)
+        else:
+            checks[reading.trial.number] = recheck(view.problem, reading.episode, reading.trial.score)
+    parts = []
+    for label, trial in (("untuned", view.untuned), (view.tuned_label, view.tuned)):
+        if trial is not None and trial.number in checks:
+            parts.append(_check_table(f"{label}, trial {trial.number}", checks[trial.number]))
+    wrong = [number for number, found in checks.items() if not all(c.agrees for c in found)]
+    text = f"{len(checks)} trials with a trace were judged again; "
+    if wrong:
+        parts.append(paragraph(f"{text}in trials {', '.join(map(str, wrong))} the stored score says something else.", "bad"))
+    else:
+        parts.append(paragraph(f"{text}every stored excess is what its trace says."))
+    parts += [paragraph(line, "bad") for line in damaged]
+    return section(title, *parts)
+
+
+def _stored(trial: Trial | None) -> list[tuple[str, float, float]]:
+    score = None if trial is None else trial.score
+    return [] if score is None else [(name, value, score.tolerance.get(name, 0.0)) for name, value in score.excess.items()]
+
+
+def _check_table(caption: str, checks: Sequence[Check]) -> str:
+    rows: list[tuple[Cell, ...]] = [
+        (
+            c.name, c.bound, c.reached, c.at_s / 60, c.excess, c.tolerance, c.judged, c.true_excess,
+            ("kept", "good") if c.kept else ("broken", "bad"),
+        )
+        for c in checks
+    ]  # fmt: skip
+    headings = ("limit", "bound", "reached", "at min", "excess", "tolerance", "judged on", "excess without noise", "")
+    return table(headings, rows, caption)
+
+
+def violations(view: StudyView) -> str:
+    broke = [t for t in view.trials if t.score is not None and not t.feasible]
+    title = "Violations during tuning"
+    if not broke:
+        return section(title, paragraph("No trial went beyond a limit by more than its tolerance."))
+    names = list(dict.fromkeys(n for t in broke if t.score is not None for n in t.score.excess))
+    rows: list[tuple[Cell, ...]] = []
+    for name in names:
+        over = [(t.score.excess[name], t.number) for t in broke if t.score is not None and _over(t, name)]
+        if over:
+            rows.append((name, len(over), *max(over), min(n for _, n in over), max(n for _, n in over)))
+    return section(
+        title,
+        paragraph(f"{len(broke)} of {len(view.trials)} trials went beyond a limit by more than its tolerance."),
+        table(("limit", "trials", "worst excess", "in trial", "first", "last"), rows),
+    )
+
+
+def _over(trial: Trial, name: str) -> bool:
+    return trial.score is not None and trial.score.excess.get(name, 0.0) > trial.score.tolerance.get(name, 0.0)
+
+
+def failures(view: StudyView) -> str:
+    failed = [t for t in view.trials if t.status is TrialStatus.FAILED]
+    if not failed:
+        return section("Failures", paragraph("No trial failed."))
+    kinds = Counter((t.ending or "unknown").partition(":")[0] for t in failed)
+    by_kind: list[tuple[Cell, ...]] = []
+    for kind, count in kinds.most_common():
+        last = next(t for t in reversed(failed) if (t.ending or "unknown").partition(":")[0] == kind)
+        by_kind.append((kind, count, last.number, (last.ending or "", "long text")))
+    return section("Failures", table(("kind", "trials", "last", "what the last one says"), by_kind))
+
+
+def sensitivities(view: StudyView, moved: Sequence[Sensitivity]) -> str:
+    parts = []
+    if moved:
+        text = (
+            f"Finite differences on the simulated plant at the result, with the seed of its trial: each entry of theta alone is moved by "
+            f"{100 * STEP:g} % of its range, down and up. Where a bar is missing, the bound is nearer or the time is not reached."
+        )
+        parts.append(paragraph(text))
+        parts.append('<div class="figures" id="sensitivity"></div>\n')
+    ranks = rank_correlations(view)
+    if ranks:
+        text = (
+            "Spearman's rank correlation over all scored trials. A tuner does not sample evenly, so this shows a tendency, not an effect."
+        )
+        rows: list[tuple[Cell, ...]] = [(entry, f"{a:+.2f}", f"{b:+.2f}") for entry, (a, b) in ranks.items()]
+        parts += [paragraph(text), table(("theta", "with the objective", "with the worst excess"), rows)]
+    return section("Sensitivity of the result", *(parts or [paragraph("Too few trials with a score.")]))
+
+
+def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
+    record = view.record
+    rows: list[tuple[Cell, ...]] = [("store", store_name(view.location))]
+    if record is not None:
+        rows += [("study begun", record.created_at), ("configuration (SHA-256)", record.identity_sha256)]
+        rows += [("seed of the study", str(record.identity.get("seed"))), ("trials proposed at a time", str(record.identity.get("batch")))]
+    if best is not None:
+        rows += [
+            (f"trial {best.number}: told", best.told_at or ""),
+            ("its seed", str(best.seed)),
+            ("its trace (SHA-256)", best.trace_sha256),
+        ]
+        rows += [(f"made with {name}", str(v)) for name, v in best.provenance.get("versions", {}).items()]
+        if reproduced and view.problem is not None:
+            off = again(view.problem, best)
+            rows.append(("evaluated again now, largest difference", "no score" if off is None else f"{off:.1e}"))
+    others = {json.dumps(t.provenance.get("versions"), sort_keys=True) for t in view.trials}
+    if len(others) > 1:
+        rows.append(("further versions", f"the trials were made with {len(others)} different sets of programs"))
+    parts = [table(("", ""), [(a, (str(b), "long text")) for a, b in rows])]
+    if record is not None:
+        text = escape(json.dumps(record.identity, indent=1, ensure_ascii=False))
+        parts.append(f"<details>\n<summary>The whole configuration</summary>\n<pre>{text}</pre>\n</details>\n")
+    return section("Provenance", *parts) + "</main>\n"

@@ -1,0 +1,146 @@
+"""A study as plain data for JSON: what it is about, and one row a trial."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
+from chargetune.report.figures.convergence import excess_unit, loss, loss_label, worst_excess
+from chargetune.report.study_view import StudyView
+from chargetune.study.trial import Trial, TrialStatus
+
+__all__ = ["study_head", "study_summary", "theta_document", "trace_csv", "trial_rows"]
+
+
+def study_head(view: StudyView) -> dict[str, Any]:
+    """What does not change from trial to trial: names, limits, the entries of theta with unit and bounds, tuner, provenance."""
+    record, problem, space = view.record, view.problem, view.space
+    unit, scale = excess_unit(view)
+    allowed = {v for t in view.trials if t.score is not None for v in t.score.tolerance.values()}
+    units = [p.unit for p in space.parameters for _ in range(p.size)]
+    return {
+        "id": None if record is None else record.id,
+        "name": view.name,
+        "created_at": "" if record is None else record.created_at,
+        "tuner": view.tuner,
+        "cell": "" if problem is None else problem.plant_cell.name,
+        "remark": "" if problem is None else problem.plant_cell.remark,
+        "loss_label": loss_label(view),
+        "excess_unit": unit,
+        "tolerance": scale * allowed.pop() if len(allowed) == 1 and unit in ("mV", "unit of the limit") else None,
+        "limits": limits_of(view),
+        "theta": [
+            {"entry": entry, "unit": u, "lower": float(low), "upper": float(high), "untuned": float(start)}
+            for entry, u, low, high, start in zip(space.entries, units, space.lower, space.upper, space.default, strict=True)
+        ],
+    }
+
+
+def limits_of(view: StudyView) -> list[dict[str, Any]]:
+    """Every limit of a charge: name, bound, unit, tolerance, and how the controller treats it; empty for another system."""
+    problem = view.problem
+    if problem is None:
+        return []
+    bounds = [("current_min_A", problem.current_min_A), ("current_max_A", problem.current_max_A)]
+    inputs = [{"name": n, "bound": b, "unit": "A", "tolerance": 0.0, "kind": "bound of the input"} for n, b in bounds if b is not None]
+    kinds = {"soft": "kept by a penalty", "hard": "kept at any price", "scored": "not seen by the controller, scored"}
+    outputs = [
+        {"name": limit.name, "bound": limit.bound, "unit": limit.unit, "tolerance": limit.tolerance, "kind": kinds[limit.kind]}
+        for limit in problem.limits
+    ]
+    return inputs + outputs
+
+
+def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """One row a trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head.
+
+    Both are None without a score. ``counted``: it may be the incumbent, being within the limits, or for the tuner "ei" scored.
+    """
+    _, scale = excess_unit(view)
+    return [
+        {
+            "number": trial.number,
+            "status": trial.status.value,
+            "ending": trial.ending or "",
+            "feasible": None if trial.score is None else trial.feasible,
+            "counted": trial.score is not None and (view.tuner == "ei" or trial.feasible),
+            "loss": _finite(loss(view, trial)),
+            "excess": _finite(scale * worst_excess(view, trial.score)),
+            "metrics": {} if trial.score is None else {name: _finite(v) for name, v in trial.score.metrics.items()},
+            "asked_at": trial.asked_at,
+            "told_at": trial.told_at or "",
+            "trace": trial.trace_sha256 is not None,
+        }
+        for trial in trials
+    ]
+
+
+def study_summary(view: StudyView) -> dict[str, Any]:
+    """One line of a list of studies."""
+    best = view.tuned
+    return {
+        "id": None if view.record is None else view.record.id,
+        "name": view.name,
+        "created_at": "" if view.record is None else view.record.created_at,
+        "tuner": view.tuner,
+        "done": sum(t.status is TrialStatus.DONE for t in view.trials),
+        "running": sum(t.status is TrialStatus.RUNNING for t in view.trials),
+        "failed": sum(t.status is TrialStatus.FAILED for t in view.trials),
+        "violating": sum(t.score is not None and not t.score.feasible for t in view.trials),
+        "best": None if best is None or not best.feasible else best.number,
+        "result": view.result.facts(),
+        "best_t95_min": None if best is None or best.score is None or not best.feasible else best.score.metrics.get("t95_min"),
+        "told_at": max((t.told_at or "" for t in view.trials), default=""),
+    }
+
+
+def theta_document(view: StudyView, trial: Trial) -> dict[str, Any]:
+    """theta of one trial to take along: ``theta`` is what `chargetune simulate --theta` and `ParameterSpace.from_dict` accept."""
+    parts = view.space.slices
+    return {
+        "study": view.name,
+        "trial": trial.number,
+        "status": trial.status.value,
+        "limits_kept": None if trial.score is None else trial.score.feasible,
+        "theta": {p.name: list(trial.theta[parts[p.name]]) if p.size > 1 else trial.theta[parts[p.name]][0] for p in view.space.parameters},
+        "units": {p.name: p.unit for p in view.space.parameters},
+        "provenance": dict(trial.provenance),
+    }
+
+
+def trace_csv(episode: Episode) -> str:
+    """A trace as CSV: one row an interval, units in the headings, every number to the last bit.
+
+    Outputs have two columns, ``name`` at the start of the interval and ``name end``; ``true`` ones follow where they are known.
+    """
+    columns: dict[str, NDArray[Any]] = {"time_s": episode.time_s}
+    for i, (name, unit) in enumerate(zip(episode.input_names, episode.input_units, strict=True)):
+        columns[_heading(name, unit)] = episode.input[:, i]
+    pairs = [("", episode.output_start, episode.output_end)]
+    if episode.true_start is not None and episode.true_end is not None:
+        pairs.append(("true ", episode.true_start, episode.true_end))
+    for before, starts, ends in pairs:
+        for i, (name, unit) in enumerate(zip(episode.output_names, episode.output_units, strict=True)):
+            columns[f"{before}{_heading(name, unit)}"] = starts[:, i]
+            columns[f"{before}{_heading(name, unit)} end"] = ends[:, i]
+    columns |= {f"estimated {name}": episode.estimate[:, i] for i, name in enumerate(episode.estimate_names)}
+    columns |= {"solver status": episode.status, "solver residual": episode.kkt, "solver iterations": episode.iterations}
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _heading(name: str, unit: str) -> str:
+    return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} [{unit}]"
+
+
+def _finite(value: float | None) -> float | None:
+    return float(f"{value:.8g}") if value is not None and math.isfinite(value) else None

@@ -1,0 +1,145 @@
+"""What a figure needs of a stored study."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.study_file import problem_of_document
+from chargetune.episode.episode import Episode
+from chargetune.model.parameter_space import ParameterSpace
+from chargetune.study.result import StudyResult, read_result
+from chargetune.study.serialization import space_from_json
+from chargetune.study.store.store import Store, StoreError, StudyRecord
+from chargetune.study.trial import Trial, TrialStatus
+
+__all__ = ["Reading", "StudyView", "read_studies", "read_study"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A trial and its stored episode; without an episode ``message`` says why."""
+
+    trial: Trial
+    episode: Episode | None
+    message: str
+
+
+@dataclass(frozen=True)
+class StudyView:
+    """A study as it stood when it was read from the store at ``location``.
+
+    ``problem`` is None when the study is not one of battery charging.
+
+    ``tuner`` is the tuner's name in the configuration, empty when that names none. ``record`` is what the store says of the
+    study as a whole, None only for trials that come from no store. ``result`` is the study's result as the store has it.
+    """
+
+    location: str
+    name: str
+    tuner: str
+    space: ParameterSpace
+    trials: tuple[Trial, ...]
+    problem: ChargingProblem | None
+    result: StudyResult
+    record: StudyRecord | None = None
+
+    @property
+    def untuned(self) -> Trial | None:
+        """The first trial of theta_0, which a tuner asks for first."""
+        default = self.space.default
+        return next((t for t in self.trials if np.array_equal(t.theta, default)), None)
+
+    @property
+    def tuned(self) -> Trial | None:
+        """The trial that is the study's result; it need not have kept the limits. None without a score."""
+        return self.result.trial
+
+    @property
+    def tuned_label(self) -> str:
+        """What a legend calls the tuned trial, so that nobody takes one that broke a limit for a success."""
+        return "tuned" if self.tuned is None or self.tuned.feasible else "tuned, violating"
+
+    @property
+    def tuned_dashes(self) -> str:
+        """Line style of the tuned run: dashed when it is the untuned one too, which then shows through."""
+        return "--" if self.tuned is not None and self.tuned is self.untuned else "-"
+
+    @property
+    def others(self) -> tuple[Trial, ...]:
+        """Told trials that are neither the untuned nor the tuned one, the failed ones included."""
+        apart = [t.number for t in (self.untuned, self.tuned) if t is not None]
+        return tuple(t for t in self.trials if t.status is not TrialStatus.RUNNING and t.number not in apart)
+
+    def episodes(self, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Episode]]:
+        """Those of ``trials`` that have a trace, each with its episode, read one at a time.
+
+        Raises StoreError for a trace that is not as it was stored, naming the trial.
+        """
+        with Store(self.location, read_only=True) as store:
+            record = store.study(self.name)
+            for trial in trials:
+                trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
+                if trace is not None:
+                    yield trial, Episode.from_arrays(*trace)
+
+    def readings(self, trials: Iterable[Trial]) -> Iterator[Reading]:
+        """Each of ``trials`` with its episode or the reason why there is none; nothing is raised for a single trace."""
+        with Store(self.location, read_only=True) as store:
+            record = store.study(self.name)
+            for trial in trials:
+                try:
+                    trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
+                    if trace is None:
+                        yield Reading(trial, None, "no trace is stored")
+                    else:
+                        yield Reading(trial, Episode.from_arrays(*trace), "")
+                except StoreError as error:
+                    yield Reading(trial, None, str(error))
+                except (KeyError, TypeError, ValueError) as error:
+                    # A program may store arrays of its own with a trial.
+                    yield Reading(trial, None, f"the stored trace is not that of an episode ({error})")
+
+    def episode(self, trial: Trial | None) -> Episode | None:
+        """The episode of one trial; None without trial or trace."""
+        return None if trial is None else next((episode for _, episode in self.episodes([trial])), None)
+
+
+def read_study(store: str | os.PathLike[str], name: str, *, trials: int | None = None) -> StudyView:
+    """Read a study, or its first ``trials`` trials, without writing to the store.
+
+    Raises StoreError for what is no store and for an unknown study, naming those that there are; ValueError for a study without trials.
+    """
+    with Store(store, read_only=True) as opened:
+        record = opened.study(name)
+        view = _view(opened, record, opened.trials(record.id)[:trials])
+    if not view.trials:
+        raise ValueError(f"{opened.label}: study {name!r} has no trials yet, so there is nothing to draw")
+    return view
+
+
+def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list[StudyView]:
+    """Every study of a store, oldest first, also those without trials; ``only`` reads the one with this id, if there is one.
+
+    Raises StoreError for what is no store.
+    """
+    with Store(store, read_only=True) as opened:
+        return [_view(opened, r, opened.trials(r.id)) for r in opened.studies() if only is None or r.id == only]
+
+
+def _view(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
+    config = record.identity["config"]
+    return StudyView(
+        location=store.location,
+        name=record.name,
+        tuner=str(config.get("study", {}).get("tuner", "")),
+        space=space_from_json(record.identity["space"]),
+        trials=tuple(trials),
+        problem=problem_of_document(config) if "cell" in config else None,
+        result=read_result(store, record, trials),
+        record=record,
+    )
