@@ -20,17 +20,17 @@ from chargetune.learning.closed_loop import search as twin_search
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.closed_loop.slp import Point
-from chargetune.learning.safe_mode import SURE, SafeAsk
-from chargetune.learning.twin import ensemble as belief
-from chargetune.learning.twin.discrepancy import Discrepancy, OutputError
+from chargetune.learning.safe_mode import SURE, SafeProposal
+from chargetune.learning.twin import ensemble
+from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
 from chargetune.learning.twin.posterior import Posterior
 from learning import arguments, measure, run
 
 _error = Discrepancy._error  # noqa: SLF001 - what is taken away has no public name
 
 
-def _no_error(self: Discrepancy, left: Any, _seed: int | None) -> OutputError:
-    return OutputError(self, np.zeros_like(_error(self, left, None).table))
+def _no_error(self: Discrepancy, left: Any, _seed: int | None) -> DiscrepancySample:
+    return DiscrepancySample(self, np.zeros_like(_error(self, left, None).table))
 
 
 def _by_window(self: Search, seen: Any) -> Point:
@@ -46,17 +46,20 @@ PARTS: dict[str, tuple[tuple[Any, str, Any], ...]] = {
     # Every plant has the error that is expected of it.
     "its samples": ((Discrepancy, "_error", lambda self, left, _: _error(self, left, None)),),
     # Where nothing was measured the twin may be as wrong as the hyperparameters of the residuals say, and no more.
-    "its floor": ((belief, "scale_of", lambda *_: 0.0),),
-    "its scale": ((belief, "scale_of", lambda *_: 1.0),),
+    "its floor": ((ensemble, "calibrate_scale", lambda *_: 0.0),),
+    "its scale": ((ensemble, "calibrate_scale", lambda *_: 1.0),),
     # The second trial is treated like those that follow.
     "unproved": ((safe_ask, "UNPROVED", 0.0), (twin_tuner, "SURE_UNPROVED", SURE)),
     # Draws are Gaussian.
     "moved draws": ((Posterior, "moved", lambda self, draws: self.mode + draws),),
-    "envelope steps": ((SafeAsk, "_expected_best", lambda self: np.array(self.trials[-1].theta)), (SafeAsk, "covered", lambda *_: None)),
-    "search": ((SafeAsk, "_searched", lambda _self, start, _deviations: [start]),),
+    "envelope steps": (
+        (SafeProposal, "_expected_best", lambda self: np.array(self.trials[-1].theta)),
+        (SafeProposal, "covered", lambda *_: None),
+    ),
+    "search": ((SafeProposal, "_searched", lambda _self, start, _deviations: [start]),),
     # The search keeps the largest excess of each window.
     "samples": ((Search, "_point", _by_window),),
-    "nearest": ((SafeAsk, "_nearer", lambda _self, candidate, _deviations: candidate[0]),),
+    "nearest": ((SafeProposal, "_nearer", lambda _self, candidate, _deviations: candidate[0]),),
 }
 
 

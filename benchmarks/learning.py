@@ -62,7 +62,7 @@ def _twin(problem: Any) -> ChargingTwin:
 METHODS = {
     "safe": _safe,
     "twin": lambda problem, seed: learning.TwinTuner(_twin(problem), seed=seed),
-    "ilc": lambda problem, _: learning.Envelope(_twin(problem)),
+    "ilc": lambda problem, _: learning.IterativeLearning(_twin(problem)),
     "composite": lambda problem, seed: learning.Composite(ChargingWindows(problem), seed=seed),
     "default": lambda _, seed: learning.ConstrainedLogEI(seed=seed),
     "ei": lambda _, seed: learning.ExpectedImprovement(seed=seed),

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Before the first import of numpy or torch: each test process has one core, and more threads would only fight for it.
+# Before the first import of numpy or torch: parallel_map test process has one core, and more threads would only fight for it.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 

@@ -10,7 +10,7 @@ from systems import controller, plant_model
 from chargetune.control.control_step import problem_of
 from chargetune.control.estimators import ExtendedKalman
 from chargetune.episode.compiled import compiled_episode, simulate
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Signal
 from chargetune.plants.simulated import SimulatedPlant
@@ -77,11 +77,13 @@ def test_the_numbers_of_a_filter_are_content():
 
 def test_outputs_of_other_names_are_another_plant():
     """A table adds to an output by its name, which the equations do not tell."""
-    own, lattice = plant_model(), Lattice.over({"force": (-1.0, 1.0)}, ["load"])
-    table = np.full((1, lattice.size), 0.05)
+    own, lookup_table = plant_model(), LookupTable.over({"force": (-1.0, 1.0)}, ["load"])
+    table = np.full((1, lookup_table.size), 0.05)
     plant = SimulatedPlant(own, {})
-    (episode,) = compiled_episode(controller(), plant, 3, compiled=False, lattice=lattice).run_each([None], [plant], tables=[table])
+    (episode,) = compiled_episode(controller(), plant, 3, compiled=False, lookup_table=lookup_table).run_each(
+        [None], [plant], tables=[table]
+    )
     np.testing.assert_allclose(episode.output_end - episode.true_end, np.tile([0.05, 0.0, 0.0], (3, 1)), atol=1e-12)
     renamed = SimulatedPlant(replace(own, outputs=(Signal("pull", "N"), *own.outputs[1:])), {})
     with pytest.raises(ValueError, match="table over 'load', allowed are pull, position"):
-        compiled_episode(controller(), renamed, 3, compiled=False, lattice=lattice)
+        compiled_episode(controller(), renamed, 3, compiled=False, lookup_table=lookup_table)

@@ -14,7 +14,7 @@ from scipy.interpolate import RegularGridInterpolator
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model
 from chargetune.plants.sensors import Sensors
@@ -270,7 +270,7 @@ def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
         same(episode, replace(episodes, plant=one).run(theta, 3))
 
 
-LATTICE = Lattice.over({"soc": (0.0, 1.0), "current_A": (-1.0, 12.0)}, ["voltage_V", "soc"])
+LATTICE = LookupTable.over({"soc": (0.0, 1.0), "current_A": (-1.0, 12.0)}, ["voltage_V", "soc"])
 
 
 @pytest.mark.parametrize("compiled", [None, False])
@@ -280,7 +280,7 @@ def test_a_constant_table_is_the_bias_of_a_sensor(charging, name, compiled):
     off = {"voltage_V": 4e-3, "soc": 0.01}
     biased = replace(plant, sensors=replace(plant.sensors, bias={k: plant.sensors.bias.get(k, 0.0) + v for k, v in off.items()}))
     table = np.tile([[v] for v in off.values()], LATTICE.size)
-    episodes = compiled_episode(controller, plant, 40, compiled=compiled, lattice=LATTICE)
+    episodes = compiled_episode(controller, plant, 40, compiled=compiled, lookup_table=LATTICE)
     episode = episodes.run_each([THETA], [plant], 3, [table])[0]
     whole = compiled_episode(controller, biased, 40, compiled=compiled).run(THETA, 3)
     assert np.max(np.abs(episode.input - episodes.run(THETA, 3).input)) > 1e-3
@@ -291,13 +291,13 @@ def test_a_constant_table_is_the_bias_of_a_sensor(charging, name, compiled):
 
 def test_without_a_table_a_lattice_changes_nothing(charging, same):
     controller, plant = loop(charging, "Kalman filter, delay 1")
-    same(compiled_episode(controller, plant, 40, lattice=LATTICE).run(THETA, 3), compiled_episode(controller, plant, 40).run(THETA, 3))
+    same(compiled_episode(controller, plant, 40, lookup_table=LATTICE).run(THETA, 3), compiled_episode(controller, plant, 40).run(THETA, 3))
 
 
 def test_what_is_measured_is_the_truth_and_the_table_there(charging):
     controller, plant = loop(charging, "ideal")
     table = np.random.default_rng(0).normal(0.0, 3e-3, (2, LATTICE.size))
-    episode = compiled_episode(controller, plant, 40, lattice=LATTICE).run_each([THETA], [plant], tables=[table])[0]
+    episode = compiled_episode(controller, plant, 40, lookup_table=LATTICE).run_each([THETA], [plant], tables=[table])[0]
     columns = [episode.output_names.index(name) for name in LATTICE.outputs]
     for measured, true in ((episode.output_start, episode.true_start), (episode.output_end, episode.true_end)):
         at = np.stack([true[:, episode.output_names.index("soc")], episode.input[:, 0]], axis=1)
@@ -316,11 +316,11 @@ def test_an_ensemble_refuses_what_does_not_belong_to_it(charging):
     other = replace(plant, model=replace(plant.model, f=ca.Function("f", list(plant.model.f.sx_in()), [plant.model.f.sx_in()[0]])))
     with pytest.raises(ValueError, match=r"plants\[1\] has another model"):
         episodes.run_each([THETA, THETA], [plant, other])
-    with pytest.raises(ValueError, match="built without a lattice"):
+    with pytest.raises(ValueError, match="built without a lookup_table"):
         episodes.run_each([THETA], [plant], tables=[np.zeros((2, LATTICE.size))])
     with pytest.raises(ValueError, match=r"a table has the shape \(2, 9\), allowed is \(2, 495\): outputs, nodes"):
-        compiled_episode(controller, plant, 10, lattice=LATTICE).run_each([THETA], [plant], tables=[np.zeros((2, 9))])
+        compiled_episode(controller, plant, 10, lookup_table=LATTICE).run_each([THETA], [plant], tables=[np.zeros((2, 9))])
     with pytest.raises(ValueError, match="table over 'temperature_K', allowed are voltage_V, soc"):
-        compiled_episode(controller, plant, 10, lattice=Lattice.over({"soc": (0.0, 1.0)}, ["temperature_K"]))
+        compiled_episode(controller, plant, 10, lookup_table=LookupTable.over({"soc": (0.0, 1.0)}, ["temperature_K"]))
     with pytest.raises(ValueError, match="allowed are 1 to 3 signals"):
-        Lattice.over({}, ["voltage_V"])
+        LookupTable.over({}, ["voltage_V"])

@@ -8,7 +8,7 @@ import torch
 
 from chargetune.episode.score import Score
 from chargetune.learning.black_box.optimize_acquisition import reproducible
-from chargetune.learning.candidate_choice import _Corrected, most_promising
+from chargetune.learning.candidate_choice import _Corrected, choose_candidate
 from chargetune.learning.twin.ensemble import Prediction
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
@@ -25,7 +25,7 @@ def verdict(theta, objective=0.0, voltage=0.0, temperature=0.0):
 
 
 class Twin:
-    """A belief whose prediction is known in closed form; nothing is foretold where b is 1."""
+    """A ensemble whose prediction is known in closed form; nothing is predicted_before where b is 1."""
 
     def scores(self, thetas):
         return [None if theta[1] == 1.0 else verdict(theta) for theta in thetas]
@@ -77,9 +77,9 @@ def test_the_prediction_is_the_twin_and_a_gaussian_process_of_what_it_left():
 
             # Every residual is the same, so it is the unit.
             gain = np.linalg.solve(kernel(x, x) + noise * np.eye(3), kernel(x, np.array(THETAS)))
-            foretold = np.array([np.mean([own(s) for s in p.scores]) for _, p in known]) / left
+            predicted_before = np.array([np.mean([own(s) for s in p.scores]) for _, p in known]) / left
             ensemble = np.array([np.std([own(s) for s in p.scores]) for _, p in known]) / left
-            np.testing.assert_allclose(mean[:, output], foretold + gain.sum(axis=0), rtol=1e-6)
+            np.testing.assert_allclose(mean[:, output], predicted_before + gain.sum(axis=0), rtol=1e-6)
             prior = np.diag(kernel(np.array(THETAS), np.array(THETAS)))
             spent = np.sum(kernel(x, np.array(THETAS)) * gain, axis=0)
             np.testing.assert_allclose(variance[:, output], prior - spent + ensemble**2, rtol=1e-5)
@@ -109,7 +109,7 @@ def test_what_the_twin_left_of_the_excess_decides_how_far_it_is_trusted(voltage,
     """The faster candidate keeps the limit as the twin has it, but not when the trials were all 80 mV nearer to it."""
     candidates = [candidate(theta, 0.01) for theta in ((0.55, 0.1), (0.45, 0.1))]
     trials = tried((0.2, 0.1), (0.3, 0.1), (0.4, 0.1), voltage=voltage)
-    theta, _ = most_promising(Twin(), SPACE, trials, candidates, 0)
+    theta, _ = choose_candidate(Twin(), SPACE, trials, candidates, 0)
     assert tuple(theta) == picked
 
 
@@ -119,28 +119,28 @@ def test_a_trial_that_only_noise_let_keep_the_limit_is_no_incumbent():
     trials = [t for a, noise in noisy for t in tried((a, 0.1), voltage=noise)]
     assert [t.score.feasible for t in trials] == [False, True, False, True]
     candidates = [candidate(theta, 0.01) for theta in ((0.66, 0.1), (0.58, 0.1))]
-    assert tuple(most_promising(Twin(), SPACE, trials, candidates, 0)[0]) == (0.58, 0.1)
+    assert tuple(choose_candidate(Twin(), SPACE, trials, candidates, 0)[0]) == (0.58, 0.1)
 
 
 def test_while_no_trial_kept_the_limits_the_likeliest_to_keep_them_is_taken():
     candidates = [candidate(theta, 0.05) for theta in ((0.6, 0.1), (0.3, 0.1))]
-    theta, _ = most_promising(Twin(), SPACE, tried((0.8, 0.1), (0.9, 0.1)), candidates, 0)
+    theta, _ = choose_candidate(Twin(), SPACE, tried((0.8, 0.1), (0.9, 0.1)), candidates, 0)
     assert tuple(theta) == (0.3, 0.1)
 
 
 def test_failed_trials_are_kept_away_from():
     candidates = [candidate(theta) for theta in ((0.5, 0.1), (0.45, 0.1))]
     done = tried((0.2, 0.1), (0.3, 0.1))
-    assert tuple(most_promising(Twin(), SPACE, done, candidates, 0)[0]) == (0.5, 0.1)
+    assert tuple(choose_candidate(Twin(), SPACE, done, candidates, 0)[0]) == (0.5, 0.1)
     failed = tried((0.5, 0.1), status="failed")
-    assert tuple(most_promising(Twin(), SPACE, [*done, *failed], candidates, 0)[0]) == (0.45, 0.1)
+    assert tuple(choose_candidate(Twin(), SPACE, [*done, *failed], candidates, 0)[0]) == (0.45, 0.1)
 
 
 def test_without_a_residual_the_first_of_which_something_is_foretold_is_taken():
     candidates = [candidate(theta) for theta in ((0.5, 1.0), (0.3, 0.1), (0.45, 0.1))]
     for trials in ([], tried((0.2, 0.1)), tried((0.2, 0.1), status="running")):
-        assert tuple(most_promising(Twin(), SPACE, trials, candidates, 0)[0]) == (0.3, 0.1)
-    assert tuple(most_promising(Twin(), SPACE, [], candidates[:1], 0)[0]) == (0.5, 1.0)
+        assert tuple(choose_candidate(Twin(), SPACE, trials, candidates, 0)[0]) == (0.3, 0.1)
+    assert tuple(choose_candidate(Twin(), SPACE, [], candidates[:1], 0)[0]) == (0.5, 1.0)
 
 
 def test_a_problem_without_limits_is_corrected_too():
@@ -153,4 +153,4 @@ def test_a_problem_without_limits_is_corrected_too():
     ]
     trials = [SimpleNamespace(number=k, theta=(a, 0.1), status="done", score=free((a,))) for k, a in enumerate((0.1, 0.2))]
     twin = SimpleNamespace(scores=lambda thetas: [free(theta) for theta in thetas])
-    assert tuple(most_promising(twin, SPACE, trials, candidates, 0)[0]) == (0.6, 0.1)
+    assert tuple(choose_candidate(twin, SPACE, trials, candidates, 0)[0]) == (0.6, 0.1)

@@ -11,8 +11,8 @@ from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.learning import Composite, Envelope, Safety, TwinTuner
-from chargetune.learning.twin.ensemble import believe
+from chargetune.learning import Composite, IterativeLearning, Safety, TwinTuner
+from chargetune.learning.twin.ensemble import condition
 from chargetune.plants.sensors import Sensors
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
@@ -27,7 +27,7 @@ TUNERS = {
     "twin": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, pool=4, steps=2, iterations=3), 4, 2),
     "safe": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, safety=Safety()), 4, 2),
     "composite": (lambda: Composite(ChargingWindows(PROBLEM), seed=2, n_initial=2), 6, 4),
-    "envelope": (lambda: Envelope(ChargingTwin(PROBLEM)), 5, 2),
+    "envelope": (lambda: IterativeLearning(ChargingTwin(PROBLEM)), 5, 2),
 }
 
 
@@ -63,13 +63,13 @@ def test_what_a_twin_remembers_changes_nothing_that_it_says():
         trials.append(Told(number, (level,), score, episode))
     used = ChargingTwin(PROBLEM)
     for n in (1, 2, 3, 4, 5, 6):
-        believe(used, trials[:n])
-    believe(used, trials[::-1])
+        condition(used, trials[:n])
+    condition(used, trials[::-1])
     for known in (trials[:2], trials):
-        remembered, fresh = (believe(loop, known) for loop in (used, ChargingTwin(PROBLEM)))
+        remembered, fresh = (condition(loop, known) for loop in (used, ChargingTwin(PROBLEM)))
         np.testing.assert_array_equal(remembered.posterior.mode, fresh.posterior.mode)
         np.testing.assert_array_equal(remembered.posterior.root, fresh.posterior.root)
-        assert (remembered.discrepancy.scale, remembered.mistake) == (fresh.discrepancy.scale, fresh.mistake)
+        assert (remembered.discrepancy.scale, remembered.standardised_error) == (fresh.discrepancy.scale, fresh.standardised_error)
         drawn, anew = (one.predict(np.array([1.55]), 4, 3).excess for one in (remembered, fresh))
         np.testing.assert_array_equal(drawn, anew)
 

@@ -17,12 +17,12 @@ from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
 from chargetune.learning import safe_mode as safe_ask
-from chargetune.learning.candidates import Ask
+from chargetune.learning.candidates import Proposal
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.nearest_theta import nearest
-from chargetune.learning.safe_mode import SafeAsk
+from chargetune.learning.safe_mode import SafeProposal
 from chargetune.learning.twin.calibration import SCALES
-from chargetune.learning.twin.ensemble import believe
+from chargetune.learning.twin.ensemble import condition
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -145,10 +145,10 @@ def test_a_safe_batch_is_of_different_thetas_that_all_passed():
     trials, _, _ = learn(problem, tuner, 2)
     batch = tuner.ask(problem.space, trials, 3)
     assert len(np.unique(batch, axis=0)) > 1
-    belief, others_seed = believe(tuner.loop, trials), 12345
+    ensemble, others_seed = condition(tuner.loop, trials), 12345
     for theta in batch:
         # Other plants than those it was chosen by: three standard errors of a share of 100 below 0.95.
-        assert belief.predict(theta, 100, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
+        assert ensemble.predict(theta, 100, others_seed).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
     running = SimpleNamespace(number=2, theta=tuple(batch[0]), status="running", score=None, episode=None)
     np.testing.assert_array_equal(tuner.ask(problem.space, [*trials, running])[0], batch[1])
 
@@ -170,13 +170,13 @@ def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_sa
     theta = np.full(9, 3.0)
     score, episode, _ = problem(theta, 0)
     loop, space = ChargingTwin(problem), problem.space
-    ask = SafeAsk(loop, space, believe(loop, trials := [told(0, theta, score, episode)]), trials, 0, Safety(), steps=5)
+    ask = SafeProposal(loop, space, condition(loop, trials := [told(0, theta, score, episode)]), trials, 0, Safety(), steps=5)
     with pytest.warns(RuntimeWarning, match="no safe improvement is known"):
         np.testing.assert_array_equal(ask._tried(), theta)
     unsafe, trace, _ = problem(problem.space.default, 0)
     trials = [told(0, problem.space.default, unsafe, trace)]
     with pytest.raises(NoSafeThetaError, match="nothing was proposed"):
-        SafeAsk(loop, space, believe(loop, trials), trials, 0, Safety(), steps=5)._tried()
+        SafeProposal(loop, space, condition(loop, trials), trials, 0, Safety(), steps=5)._tried()
 
 
 def test_a_trial_that_left_no_trace_does_not_have_the_start_judged_anew():
@@ -195,7 +195,7 @@ def after_one_charge():
     loop = ChargingTwin(problem)
     score, episode, _ = problem(theta, 0)
     trials = [told(0, theta, score, episode)]
-    return SafeAsk(loop, problem.space, believe(loop, trials), trials, 0, Safety(), steps=5), theta
+    return SafeProposal(loop, problem.space, condition(loop, trials), trials, 0, Safety(), steps=5), theta
 
 
 def test_where_the_aim_is_not_safe_the_longest_part_of_the_way_that_is_safe_is_gone():
@@ -232,8 +232,8 @@ def test_searches_lead_from_a_safe_theta_to_better_ones():
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     trials, _, _ = learn(problem, tuner, 3)
     ask = tuner._safe_ask(problem.space, trials, tuner.safety)
-    # The first trial was foretold by none.
-    assert ask.belief.foretold == 2
+    # The first trial was predicted_before by none.
+    assert ask.ensemble.predicted_before == 2
     begin = ask.candidate(ask._expected_best())
     deviations = ask._deviations(begin)
     # The best theta on the expected plant breaks a limit on most plants; the searches begin at one far from it.
@@ -242,11 +242,11 @@ def test_searches_lead_from_a_safe_theta_to_better_ones():
     found = ask._searched(start, deviations)
     assert found[-1] is start
     assert all(predicted.probability() >= 0.95 for _, predicted in found)
-    objectives = [score.objective for score in ask.belief.scores([theta for theta, _ in found])]
+    objectives = [score.objective for score in ask.ensemble.scores([theta for theta, _ in found])]
     assert objectives == sorted(objectives, reverse=True)
     assert len(found) > 1
     # What is kept back costs less than a tenth of the time of the best theta on the expected plant; where they began it cost a fifth.
-    best = ask.belief.scores([begin[0]])[0].objective
+    best = ask.ensemble.scores([begin[0]])[0].objective
     assert objectives[0] > 1.1 * best > 1.2 * best > objectives[-1]
 
 
@@ -267,9 +267,9 @@ def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_d
     assert len(seen) > 2
 
 
-def deviations_after(foretold, near):
-    """What is kept back when so many trials were foretold and so many windows are near their limit."""
-    ask = SafeAsk(None, None, SimpleNamespace(foretold=foretold), [], 0, Safety(probability=0.9), 5)
+def deviations_after(predicted_before, near):
+    """What is kept back when so many trials were predicted_before and so many windows are near their limit."""
+    ask = SafeProposal(None, None, SimpleNamespace(predicted_before=predicted_before), [], 0, Safety(probability=0.9), 5)
     windows = np.array([0.2] * near + [-0.5] * 20 + [np.nan])
     return ask._deviations((None, SimpleNamespace(upper_windows=lambda _: windows)))
 
@@ -283,7 +283,7 @@ def test_as_many_deviations_are_kept_back_as_the_windows_that_may_break_need_tog
 
 
 def test_less_is_kept_back_the_more_trials_were_foretold_and_never_less_than_the_quantile():
-    kept_back = [deviations_after(foretold, 3) for foretold in range(4)]
+    kept_back = [deviations_after(predicted_before, 3) for predicted_before in range(4)]
     assert kept_back == sorted(kept_back, reverse=True)
     assert len(set(kept_back)) == 4
     assert kept_back[-1] > norm.ppf(0.9 ** (1 / 3))
@@ -303,7 +303,7 @@ def unforeseen(problem):
 def test_a_twin_that_foresaw_nothing_leaves_it_to_the_black_box_and_says_so():
     problem = charge(noise=0.0)
     trials, tuner = unforeseen(problem), TwinTuner(ChargingTwin(problem))
-    assert believe(tuner.loop, trials).mistake > 4
+    assert condition(tuner.loop, trials).standardised_error > 4
     with pytest.warns(RuntimeWarning, match="the black box's"):
         proposed = tuner.ask(problem.space, trials)
     assert proposed.shape == (1, 9)
@@ -323,7 +323,7 @@ def test_a_twin_that_foresaw_nothing_is_not_asked_what_is_safe():
 
 def test_errors_beyond_every_scale_are_said():
     ask, theta = after_one_charge()
-    ask = replace(ask, belief=replace(ask.belief, discrepancy=ask.belief.discrepancy.scaled(SCALES[-1])))
+    ask = replace(ask, ensemble=replace(ask.ensemble, discrepancy=ask.ensemble.discrepancy.scaled(SCALES[-1])))
     with pytest.warns(RuntimeWarning, match="more than it can allow for"):
         np.testing.assert_array_equal(ask.thetas(), [theta])
 
@@ -331,10 +331,10 @@ def test_errors_beyond_every_scale_are_said():
 def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch):
     """What comes out of the search is put where the limit breaks: a part of the way there is proposed, and it holds on other plants."""
     ask, theta = after_one_charge()
-    monkeypatch.setattr(SafeAsk, "_nearer", lambda *_: np.full(9, 1.2))
+    monkeypatch.setattr(SafeProposal, "_nearer", lambda *_: np.full(9, 1.2))
     assert not ask._holds(np.full(9, 1.2))
     (proposed,) = ask.thetas()
-    assert ask.belief.predict(proposed, 100, 12345).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
+    assert ask.ensemble.predict(proposed, 100, 12345).probability() >= 0.95 - 3 * (0.95 * 0.05 / 100) ** 0.5
     assert 1.2 < proposed[0] < theta[0]
     np.testing.assert_allclose(proposed, proposed[0])
 
@@ -356,8 +356,8 @@ def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
     assert "voltage_V" in ending
     assert np.max(np.maximum(start, end)[:-1]) <= 4.22 < max(start[-1], end[-1])
     # It is learnt from like any other trace.
-    belief = believe(ChargingTwin(problem), [told(0, problem.space.default, None, episode)])
-    assert belief.discrepancy is not None
+    ensemble = condition(ChargingTwin(problem), [told(0, problem.space.default, None, episode)])
+    assert ensemble.discrepancy is not None
     whole = replace(problem, abort_margin_V=None).episode()
     assert len(episode) < len(whole)
     np.testing.assert_array_equal(episode.input, whole.input[: len(episode)])
@@ -394,7 +394,7 @@ def test_the_result_is_the_quickest_trial_that_truly_kept_the_limit():
     kept = [k for k, score in enumerate(true) if score.feasible]
     assert kept == [0, 3, 4]
     assert tuner.best(problem.space, trials) == max(kept, key=lambda k: true[k].objective) == 3
-    ask = Ask(tuner.loop, problem.space, believe(tuner.loop, trials), trials, 0)
+    ask = Proposal(tuner.loop, problem.space, condition(tuner.loop, trials), trials, 0)
     for trial, score in zip(trials, true, strict=True):
         again, anew = (worst_mV(one, problem) for one in (ask.tried(trial)[1], ask.predicted(np.array(trial.theta))))
         assert again.std() < max(1.0, 0.5 * anew.std())

@@ -7,7 +7,7 @@ import pytest
 
 from chargetune.episode.score import Score
 from chargetune.learning import NoSafeThetaError, Safety
-from chargetune.learning.safe_mode import SafeAsk
+from chargetune.learning.safe_mode import SafeProposal
 from chargetune.learning.twin.ensemble import Prediction
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
@@ -36,18 +36,18 @@ class Sides:
         return Prediction(Verdict(), tuple(float(value) for value in excess))
 
 
-def ask(belief):
-    space = ParameterSpace(tuple(Parameter(f"p{i}", 0.0, 1.0, 0.5) for i in range(belief.safe.size)))
-    return SafeAsk(Verdict(), space, belief, [], 0, Safety(), steps=5)
+def ask(ensemble):
+    space = ParameterSpace(tuple(Parameter(f"p{i}", 0.0, 1.0, 0.5) for i in range(ensemble.safe.size)))
+    return SafeProposal(Verdict(), space, ensemble, [], 0, Safety(), steps=5)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 12])
 def test_the_start_is_the_one_safe_corner_and_few_loops_find_it(count):
     safe = np.random.default_rng(count).integers(0, 2, count).astype(float)
-    belief = Sides(safe, count - 1.0)
-    np.testing.assert_array_equal(ask(belief).thetas(), [safe])
+    ensemble = Sides(safe, count - 1.0)
+    np.testing.assert_array_equal(ask(ensemble).thetas(), [safe])
     # Twelve parameters have 4096 corners, of 64 loops each.
-    assert sum(belief.loops) < 1000
+    assert sum(ensemble.loops) < 1000
 
 
 def test_where_no_corner_is_safe_that_is_said():

@@ -53,7 +53,7 @@ class TunerChoice(StrEnum):
     EI = "ei"
     SOBOL = "sobol"
     TWIN = "twin"
-    ENVELOPE = "envelope"
+    ITERATIVE_LEARNING = "iterative_learning"
     COMPOSITE = "composite"
 
 
@@ -185,7 +185,7 @@ def reproduce(
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
     trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
     tuner: Annotated[
-        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, Sobol points, the twin, or envelope steps.")
+        TunerChoice, typer.Option(help="The constrained default, the paper's EI on G, Sobol points, the twin, or iterative learning.")
     ] = TunerChoice.DEFAULT,
     workers: Workers = 2,
     out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(
@@ -258,7 +258,7 @@ def certify(
     as_json: AsJson = False,
 ) -> None:
     """Run the tuned controller on fresh episodes with other plants and bound the probability of a violation."""
-    from chargetune.battery.certification.variations import Spread
+    from chargetune.battery.certification.variations import PlantVariation
     from chargetune.cli.certify import certify_command
 
     certify_command(
@@ -268,7 +268,7 @@ def certify(
         episodes=episodes,
         seed=seed,
         confidence=confidence,
-        spread=Spread(soc_start, resistance, capacitance, capacity, fade, growth),
+        spread=PlantVariation(soc_start, resistance, capacitance, capacity, fade, growth),
         workers=workers,
         output=output,
         as_json=as_json,

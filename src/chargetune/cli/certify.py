@@ -10,7 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
-from chargetune.battery.certification.variations import Spread
+from chargetune.battery.certification.variations import PlantVariation
 from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
@@ -30,7 +30,7 @@ def certify_command(
     episodes: int,
     seed: int,
     confidence: float,
-    spread: Spread,
+    spread: PlantVariation,
     workers: int,
     output: Path | None,
     as_json: bool,
@@ -134,4 +134,4 @@ def _print(certificate: dict[str, Any]) -> None:
         )
         screen.print(f"{name.removesuffix('_min')} in minutes: {values}")
     spread = ", ".join(f"{name} {value:g}" for name, value in certificate["spread"].items())
-    screen.print(f"[dim]{certificate['meaning']} Spread: {spread}.[/]", soft_wrap=True)
+    screen.print(f"[dim]{certificate['meaning']} PlantVariation: {spread}.[/]", soft_wrap=True)

@@ -137,7 +137,7 @@ def _run(
         try:
             # Without batches more workers have something to do only if the order of the trials is given up for them; and
             # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner == "envelope"
+            alone = study.batch > 1 or config.safety is not None or config.study.tuner == "iterative_learning"
             ahead = workers if workers > 1 and not alone else None
             study.run(problem, count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:

@@ -21,14 +21,14 @@ from chargetune.control.control_step import begin, control_step, problem_of
 from chargetune.control.controller import Controller
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 from chargetune.runtime.cache import cached
 from chargetune.runtime.compiler import compile_library, find_compiler
-from chargetune.runtime.numpy_call import evaluated
+from chargetune.runtime.numpy_call import numpy_call
 from chargetune.runtime.split import split
-from chargetune.runtime.threads import each
+from chargetune.runtime.threads import parallel_map
 
 __all__ = ["CompiledEpisode", "compiled_episode", "simulate"]
 
@@ -43,7 +43,7 @@ class CompiledEpisode:
     compiled: bool
     function: ca.Function
     prepare_plant: ca.Function
-    lattice: Lattice | None = None
+    lookup_table: LookupTable | None = None
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -54,7 +54,7 @@ class CompiledEpisode:
     def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
         """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
         given, unknown = self._arguments(theta, self.plant, seed, trips)
-        (recorded,) = evaluated(self.function, given, unknown)
+        (recorded,) = numpy_call(self.function, given, unknown)
         return self._episode(recorded, self.plant, seed, trips)
 
     def run_each(
@@ -67,7 +67,7 @@ class CompiledEpisode:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
         The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
-        What each of ``tables`` (`Lattice`) says of the true outputs is added to what is measured, and so read by the estimator.
+        What each of ``tables`` (`LookupTable`) says of the true outputs is added to what is measured, and so read by the estimator.
         Raises ValueError when there are not as many of all, or one does not fit.
         """
         tables = [None] * len(plants) if tables is None else tables
@@ -90,9 +90,9 @@ class CompiledEpisode:
                 of_plant[id(plant)] = self._of_plant(plant, seed)
             given.append(self._given(of_theta[key], of_plant[id(plant)], table))
             unknown.append(of_plant[id(plant)].unknown)
-        run = partial(evaluated, self.function)
+        run = partial(numpy_call, self.function)
         # The loops alone go into threads, as machine code: all else waits for the interpreter.
-        recorded = each(run, given, unknown) if self.compiled and len(plants) > 1 else list(map(run, given, unknown))
+        recorded = parallel_map(run, given, unknown) if self.compiled and len(plants) > 1 else list(map(run, given, unknown))
         return [self._episode(one, plant, seed, ()) for (one,), plant in zip(recorded, plants, strict=True)]
 
     def _arguments(
@@ -120,11 +120,11 @@ class CompiledEpisode:
         self, of_theta: Sequence[NDArray[np.float64]], of_plant: _OfPlant, table: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         given = [of_plant.start, *of_theta, of_plant.numbers]
-        if self.lattice is not None:
-            nothing = np.zeros((len(self.lattice.outputs), self.lattice.size))
-            given.append(self.lattice.coefficients(nothing if table is None else table))
+        if self.lookup_table is not None:
+            nothing = np.zeros((len(self.lookup_table.outputs), self.lookup_table.size))
+            given.append(self.lookup_table.coefficients(nothing if table is None else table))
         elif table is not None:
-            raise ValueError("a table was given, allowed is none: these episodes were built without a lattice")
+            raise ValueError("a table was given, allowed is none: these episodes were built without a lookup_table")
         return np.concatenate([*given, of_plant.at_rest])
 
     def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
@@ -164,9 +164,9 @@ class _OfPlant(NamedTuple):
 
 
 def compiled_episode(
-    controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None, lattice: Lattice | None = None
+    controller: Controller, plant: SimulatedPlant, steps: int, *, compiled: bool | None = None, lookup_table: LookupTable | None = None
 ) -> CompiledEpisode:
-    """The function for this controller and plant, built and compiled once a content; with ``lattice`` it takes tables of errors.
+    """The function for this controller and plant, built and compiled once a content; with ``lookup_table`` it takes tables of errors.
 
     ``compiled=None`` compiles when there is a C compiler, and where that fails warns and uses CasADi's virtual machine,
     which is slower and gives the same result; ``False`` uses the virtual machine; ``True`` raises RuntimeError or
@@ -174,22 +174,22 @@ def compiled_episode(
     """
     check_run(plant, steps, 0, ())
     indices = tuple(signal_indices(controller, plant))
-    # A lattice finds the outputs by name.
+    # A lookup_table finds the outputs by name.
     own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.model.output_names} {plant.sensors.delay_steps}"
     use = find_compiler() is not None if compiled is None else compiled
-    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices} {lattice}"
+    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices} {lookup_table}"
 
     def build() -> tuple[ca.Function, ca.Function, bool]:
         try:
-            return *(_compiled if use else _built)(controller, plant, indices, steps, lattice), use
+            return *(_compiled if use else _built)(controller, plant, indices, steps, lookup_table), use
         except (RuntimeError, OSError) as error:
             if compiled or not use:
                 raise
             warnings.warn(f"episodes run on the virtual machine, about 8 times slower: {error}", RuntimeWarning, stacklevel=5)
-            return *_built(controller, plant, indices, steps, lattice), False
+            return *_built(controller, plant, indices, steps, lookup_table), False
 
     function, prepare, used = cached(key, build)
-    return CompiledEpisode(controller, plant, steps, used, function, prepare, lattice)
+    return CompiledEpisode(controller, plant, steps, used, function, prepare, lookup_table)
 
 
 def simulate(
@@ -225,11 +225,11 @@ def _content(function: ca.Function) -> str:
 
 
 def _compiled(
-    controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, lattice: Lattice | None
+    controller: Controller, plant: SimulatedPlant, indices: tuple[int, ...], steps: int, lookup_table: LookupTable | None
 ) -> tuple[ca.Function, ca.Function]:
     """(the episode as machine code, p -> q of the plant)."""
     problem = problem_of(controller)
-    episode, prepare = _built(controller, plant, indices, steps, lattice, daqp_warm)
+    episode, prepare = _built(controller, plant, indices, steps, lookup_table, daqp_warm)
     generator = ca.CodeGenerator("episode", {"with_header": False})
     generator.add(episode)
     sources, defines = warm_sources(len(controller.limits), problem.size, problem.size + len(problem.groups))
@@ -242,7 +242,7 @@ def _built(
     plant: SimulatedPlant,
     indices: tuple[int, ...],
     steps: int,
-    lattice: Lattice | None,
+    lookup_table: LookupTable | None,
     qp: QPSolver = daqp,
 ) -> tuple[ca.Function, ca.Function]:
     """(the episode for CasADi's virtual machine, p -> q of the plant)."""
@@ -255,7 +255,7 @@ def _built(
     memory, last, warm, q = (ca.MX.sym(n, k) for n, k in sizes.items())
     plant_q, resolution = ca.MX.sym("plant_q", prepare.size1_out(0)), ca.MX.sym("resolution", ny)
     error_start, error_end, noise = ca.MX.sym("e0", ny), ca.MX.sym("e1", ny), ca.MX.sym("w", nx)
-    measure, added = _measure(ny), lattice.function(plant.model.output_names, plant.model.input_names) if lattice else None
+    measure, added = _measure(ny), lookup_table.function(plant.model.output_names, plant.model.input_names) if lookup_table else None
     table = ca.MX.sym("table", added.size1_in(2) if added else 0)
 
     def errs(y: ca.MX, u: ca.MX, table: ca.MX) -> ca.MX:

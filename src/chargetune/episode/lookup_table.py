@@ -10,14 +10,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Lattice"]
+__all__ = ["LookupTable"]
 
 # Nodes along each signal, by the number of signals.
 NODES = {1: (101,), 2: (33, 15), 3: (21, 7, 5)}
 
 
 @dataclass(frozen=True)
-class Lattice:
+class LookupTable:
     """Nodes of a table over one to three signals: evenly spaced within their ranges, linear in between, held beyond.
 
     ``ranges``: (name, lower, upper) of every signal, the first one with the most nodes; ``outputs``: those that a table adds to.
@@ -28,7 +28,7 @@ class Lattice:
     outputs: tuple[str, ...]
 
     @classmethod
-    def over(cls, ranges: Mapping[str, tuple[float, float]], outputs: Sequence[str]) -> Lattice:
+    def over(cls, ranges: Mapping[str, tuple[float, float]], outputs: Sequence[str]) -> LookupTable:
         """Raises ValueError for another number of signals than one to three."""
         if len(ranges) not in NODES:
             raise ValueError(f"table over {sorted(ranges)}, allowed are 1 to {max(NODES)} signals")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
     from chargetune.learning.black_box.expected_improvement import ExpectedImprovement
     from chargetune.learning.black_box.gaussian_process import GaussianProcess
-    from chargetune.learning.closed_loop.iterative_learning import Envelope
+    from chargetune.learning.closed_loop.iterative_learning import IterativeLearning
     from chargetune.learning.initial_design import Sobol
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.tuner import TrialLike, Tuner
@@ -21,14 +21,26 @@ if TYPE_CHECKING:
     from chargetune.learning.twin_tuner import TwinTuner
 
 __all__ = [
-    "Composite", "ConstrainedLogEI", "Envelope", "ExpectedImprovement", "GaussianProcess", "NoSafeThetaError", "Posterior", "Safety",
-    "Sobol", "TrialLike", "Tuner", "Twin", "TwinTuner", "Uncertain",
-]  # fmt: skip
+    "Composite",
+    "ConstrainedLogEI",
+    "ExpectedImprovement",
+    "GaussianProcess",
+    "IterativeLearning",
+    "NoSafeThetaError",
+    "Posterior",
+    "Safety",
+    "Sobol",
+    "TrialLike",
+    "Tuner",
+    "Twin",
+    "TwinTuner",
+    "Uncertain",
+]
 
 _MODULES = {
     "Composite": "black_box.composite",
     "ConstrainedLogEI": "black_box.constrained_ei",
-    "Envelope": "closed_loop.iterative_learning",
+    "IterativeLearning": "closed_loop.iterative_learning",
     "ExpectedImprovement": "black_box.expected_improvement",
     "GaussianProcess": "black_box.gaussian_process",
     "NoSafeThetaError": "safety",

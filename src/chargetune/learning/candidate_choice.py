@@ -23,17 +23,17 @@ from chargetune.learning.black_box.failure_penalty import AwayFromFailures
 from chargetune.learning.black_box.gaussian_process import GaussianProcess
 from chargetune.learning.black_box.optimize_acquisition import reproducible
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin.ensemble import Belief, Prediction
+from chargetune.learning.twin.ensemble import Ensemble, Prediction
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["Candidate", "most_promising"]
+__all__ = ["Candidate", "choose_candidate"]
 
 Candidate = tuple[NDArray[np.float64], Prediction]
 """A theta and what the ensemble of plants does with it."""
 
 # One trial says nothing of what remains.
 PROVED = 2
-# Of a value: a twin that foretold every score to the last digit leaves nothing to be scaled by.
+# Of a value: a twin that predicted_before every score to the last digit leaves nothing to be scaled by.
 LEAST = 1e-9
 # Of the search for the hyperparameters. It is to tell a handful of candidates apart: three times as many tell them apart no differently.
 ITERATIONS = 10
@@ -41,21 +41,21 @@ ITERATIONS = 10
 FAR = 8.0
 
 
-def most_promising(
-    belief: Belief, space: ParameterSpace, trials: Sequence[TrialLike], candidates: Sequence[Candidate], seed: int
+def choose_candidate(
+    ensemble: Ensemble, space: ParameterSpace, trials: Sequence[TrialLike], candidates: Sequence[Candidate], seed: int
 ) -> Candidate:
     """The candidate of the largest constrained log expected improvement on the corrected prediction, the earlier of equals.
 
     For the objective and for the worst excess of every limit, y(theta) = m(theta) + f(theta) + noise, where m is the score of the
-    expected episode (`Belief.central`), f ~ GP(0, s^2 k) with s the rms of y - m over the trials and k as in `GaussianProcess`; the
+    expected episode (`Ensemble.central`), f ~ GP(0, s^2 k) with s the rms of y - m over the trials and k as in `GaussianProcess`; the
     variance at a candidate is that of f plus that of the ensemble. Improvement is over the best trial that m + f
     calls kept; while there is none, the probability of keeping them decides. Near failed trials it is lower (`AwayFromFailures`).
-    Candidates of which nothing is foretold are passed over. With fewer than `PROVED` trials the first of them is returned: a twin
+    Candidates of which nothing is predicted_before are passed over. With fewer than `PROVED` trials the first of them is returned: a twin
     reproduces the trial that it was made from. Source of the acquisition: Ament et al., NeurIPS 2023.
     """
     seen = [t for t in trials if t.score is not None]
     known = [c for c in candidates if c[1].scores]
-    done = [(t, s) for t, s in zip(seen, belief.scores([np.array(t.theta) for t in seen]), strict=True) if s is not None]
+    done = [(t, s) for t, s in zip(seen, ensemble.scores([np.array(t.theta) for t in seen]), strict=True) if s is not None]
     if len(known) < 2 or len(done) < PROVED:
         return (known or list(candidates))[0]
     failed = [t.theta for t in trials if t.score is None and t.status != "running"]
@@ -79,17 +79,17 @@ class _Corrected(Model):
         measured = np.array([_values(t.score) for t, _ in done if t.score is not None])
         ensembles = [np.array([_values(s) for s in predicted.scores]) for _, predicted in known]
         # A trial is known, and the expected episode says it all; of a candidate the worst of many windows is worse than the expected one.
-        foretold = np.array([*(_values(s) for _, s in done), *(e.mean(axis=0) for e in ensembles)])
-        scale = np.sqrt(np.mean((measured - foretold[: len(done)]) ** 2, axis=0))
-        scale = np.maximum(scale, LEAST * np.max(np.abs(foretold), axis=0)) + np.finfo(float).tiny
+        predicted_before = np.array([*(_values(s) for _, s in done), *(e.mean(axis=0) for e in ensembles)])
+        scale = np.sqrt(np.mean((measured - predicted_before[: len(done)]) ** 2, axis=0))
+        scale = np.maximum(scale, LEAST * np.max(np.abs(predicted_before), axis=0)) + np.finfo(float).tiny
         # A limit that nothing comes near has the probability 1, and needs no process to say so.
-        near = np.max(np.vstack([measured, foretold]) / scale, axis=0) > -FAR
+        near = np.max(np.vstack([measured, predicted_before]) / scale, axis=0) > -FAR
         near[0] = True
-        measured, foretold, scale = measured[:, near], foretold[:, near], scale[near]
+        measured, predicted_before, scale = measured[:, near], predicted_before[:, near], scale[near]
         points = space.to_unit(np.array([*(t.theta for t, _ in done), *(theta for theta, _ in known)]))
-        x, left = torch.as_tensor(points[: len(done)]), torch.as_tensor((measured - foretold[: len(done)]) / scale)
+        x, left = torch.as_tensor(points[: len(done)]), torch.as_tensor((measured - predicted_before[: len(done)]) / scale)
         self._model = ModelListGP(GaussianProcess(mean=ZeroMean, standardise=False, iterations=ITERATIONS).fit(x, left))
-        self._foretold = _Table(points, foretold / scale)
+        self._foretold = _Table(points, predicted_before / scale)
         self._spread = _Table(points[len(done) :], np.array([e.std(axis=0) for e in ensembles])[:, near] / scale)
         self._outputs = len(scale)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Safe mode: envelope steps on the upper side of the belief, and of what is safe enough the nearest that promises as much."""
+"""Safe mode: envelope steps on the upper side of the ensemble, and of what is safe enough the nearest that promises as much."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from chargetune.learning.candidate_choice import Candidate
-from chargetune.learning.candidates import WON, Ask
+from chargetune.learning.candidates import WON, Proposal
 from chargetune.learning.closed_loop.covering import covering
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.nearest_theta import nearest
@@ -21,27 +21,27 @@ from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.twin.ensemble import episodes_of
 
-__all__ = ["SURE", "SURE_UNPROVED", "SafeAsk"]
+__all__ = ["SURE", "SURE_UNPROVED", "SafeProposal"]
 
-# How sure a safe belief is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
-# quantiles, the fewer there are the more is left to allow for. Before a trial was foretold: so that 90 % intervals of the second one
+# How sure a safe ensemble is that its errors are at most as large as it takes them for: few stretches tell, and as with Student's
+# quantiles, the fewer there are the more is left to allow for. Before a trial was predicted_before: so that 90 % intervals of the second one
 # cover 90 % of it, on plants that the twin can be and on such as it cannot.
 SURE, SURE_UNPROVED = 0.84, 0.93
 # Of a limit's tolerance, what the upper side of the prediction may use after envelope steps, searches, and the one for the nearest theta.
 AIMED = 0.75
-# Envelope steps on the upper side of the prediction, which is that at the theta found last.
+# IterativeLearning steps on the upper side of the prediction, which is that at the theta found last.
 ROUNDS = 7
 # A round that moves no entry by more than this share of its range was the last one,
 SETTLED = 5e-3
-# or that changes the objective expected of what is safe by less than this share. Before a trial was foretold no search follows that goes
+# or that changes the objective expected of what is safe by less than this share. Before a trial was predicted_before no search follows that goes
 # the rest of the way.
 UNCHANGED, UNCHANGED_UNPROVED = 3e-3, 1e-3
 # A window that so many standard deviations keep below its limit does not count among those that have to hold together.
 NEAR = 3.0
-# Beyond the quantile for these windows together: draws are few, and not Gaussian. The more trials were foretold by those before them the
+# Beyond the quantile for these windows together: draws are few, and not Gaussian. The more trials were predicted_before by those before them the
 # more of it is proved needless: it is divided by their number.
 BEYOND = 0.5
-# Before it has foretold a trial the twin is trusted less: its prior is no more than a guess.
+# Before it has predicted_before a trial the twin is trusted less: its prior is no more than a guess.
 UNPROVED = 1.0
 # Factor on the deviations where they do not suffice.
 WIDER = 1.25
@@ -59,8 +59,8 @@ CORNERS_OF = 3
 
 
 @dataclass(frozen=True)
-class SafeAsk(Ask):
-    """An ask whose thetas keep every limit as ``safety`` states, as far as the belief tells; begun by ``steps`` on the expected plant."""
+class SafeProposal(Proposal):
+    """An ask whose thetas keep every limit as ``safety`` states, as far as the ensemble tells; begun by ``steps`` on the expected plant."""
 
     safety: Safety
     steps: int
@@ -71,11 +71,11 @@ class SafeAsk(Ask):
 
         Raises NoSafeThetaError where there is none, or the budget is spent.
         """
-        if self.belief.discrepancy is None:
+        if self.ensemble.discrepancy is None:
             # Trials that left no trace have taught nothing.
             return [self._start()]
         self._check_budget()
-        if self.belief.mistaken or self.belief.beyond_scale:
+        if self.ensemble.mistaken or self.ensemble.beyond_scale:
             return [self._kept_again()]
         # Only what comes after the envelope steps needs the ensemble.
         self.draw()
@@ -84,11 +84,11 @@ class SafeAsk(Ask):
         passed = self._rounds(begin, deviations)
         if not passed:
             return [self._tried()]
-        if self.belief.proved:
+        if self.ensemble.proved:
             passed = [*self._searched(passed[0], deviations), *passed[1:]]
-        first = self._nearer(self.most_promising(passed), deviations)
+        first = self._nearer(self.choose_candidate(passed), deviations)
         # After a single trial the others are further ahead, and the prior has not yet been wrong.
-        others = [theta for theta, _ in passed if self.belief.proved and not np.array_equal(theta, first)]
+        others = [theta for theta, _ in passed if self.ensemble.proved and not np.array_equal(theta, first)]
         held = list(islice(filter(self._holds, [first, *others]), count))
         return held or [self._back_from(first)]
 
@@ -97,7 +97,7 @@ class SafeAsk(Ask):
 
         Of many candidates that are judged by the same plants those are found that just these allow: their share says too much.
         """
-        return self.belief.predict(theta, JUDGES, self.seed + FRESH).probability() >= self.safety.probability
+        return self.ensemble.predict(theta, JUDGES, self.seed + FRESH).probability() >= self.safety.probability
 
     def _back_from(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of the way from the best trial that kept the limits to theta the longest of `PARTS` that holds, else what was tried."""
@@ -111,8 +111,8 @@ class SafeAsk(Ask):
     def _kept_again(self) -> NDArray[np.float64]:
         """The best theta that kept every limit as measured: a twin that was wrong says nothing of another one."""
         what = (
-            f"the twin did not foresee the last trial (off by {self.belief.mistake:.0f} times what it allows for)"
-            if self.belief.mistaken
+            f"the twin did not foresee the last trial (off by {self.ensemble.standardised_error:.0f} times what it allows for)"
+            if self.ensemble.mistaken
             else "the twin is off by more than it can allow for"
         )
         known = self._kept()
@@ -136,9 +136,9 @@ class SafeAsk(Ask):
         """From a candidate on, thetas that are safe enough, by the objective expected of them."""
         theta = candidate[0]
         passed: list[tuple[float, Candidate]] = []
-        unchanged = UNCHANGED if self.belief.proved else UNCHANGED_UNPROVED
+        unchanged = UNCHANGED if self.ensemble.proved else UNCHANGED_UNPROVED
         for k in range(ROUNDS):
-            candidate, expected = self.candidate(theta) if k else candidate, self.belief.central(theta)
+            candidate, expected = self.candidate(theta) if k else candidate, self.ensemble.central(theta)
             score = None if expected is None else self.loop.score(expected)
             if score is None:
                 break
@@ -181,14 +181,14 @@ class SafeAsk(Ask):
         """
         near = int(np.sum(candidate[1].upper_windows(NEAR) > 0))
         together = float(norm.ppf(self.safety.probability ** (1 / max(near, 1))))
-        foretold = self.belief.foretold
-        return together + (BEYOND / foretold if foretold else BEYOND + UNPROVED)
+        predicted_before = self.ensemble.predicted_before
+        return together + (BEYOND / predicted_before if predicted_before else BEYOND + UNPROVED)
 
     def _expected_best(self) -> NDArray[np.float64]:
-        """What the plant would allow if the belief were true: from there on caution only takes back."""
+        """What the plant would allow if the ensemble were true: from there on caution only takes back."""
         theta = np.array(self.trials[-1].theta)
         for _ in range(self.steps):
-            episode = self.belief.central(theta)
+            episode = self.ensemble.central(theta)
             if episode is None:
                 break
             theta, before = covering(self.loop.controller, episode, theta, self.loop.measured_rows(episode)), theta
@@ -199,7 +199,7 @@ class SafeAsk(Ask):
     def _nearer(self, candidate: Candidate, deviations: float) -> NDArray[np.float64]:
         """Of the safe thetas that promise as much as this one the nearest to the best trial's, or one on the way to it."""
         theta, predicted = candidate
-        search = Search(self.loop, self.belief.expected, self.space)
+        search = Search(self.loop, self.ensemble.expected, self.space)
         score, known = search.score(self.space.to_unit(theta)), self._kept()
         if score is None or not known:
             return theta

@@ -12,13 +12,13 @@ from threadpoolctl import threadpool_limits
 
 from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
 from chargetune.learning.candidate_choice import Candidate
-from chargetune.learning.candidates import Ask
+from chargetune.learning.candidates import Proposal
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.initial_design import initial_design, sobol_points
-from chargetune.learning.safe_mode import SURE, SURE_UNPROVED, SafeAsk
+from chargetune.learning.safe_mode import SURE, SURE_UNPROVED, SafeProposal
 from chargetune.learning.safety import Safety
 from chargetune.learning.tuner import TrialLike, check_count
-from chargetune.learning.twin.ensemble import believe
+from chargetune.learning.twin.ensemble import condition
 from chargetune.learning.twin.twin_loop import TwinLoop
 from chargetune.model.parameter_space import ParameterSpace
 
@@ -30,7 +30,7 @@ CAUTION = (2.0, 3.0)
 LIKELY = 0.32
 # Of the objective, what no standard deviation is worth: so much worse a theta is kept, and of no use.
 USELESS = 0.1
-# Envelope steps that take them back.
+# IterativeLearning steps that take them back.
 STEPS_BACK = 2
 # Two starts that are closer than this share of the range in every entry lead to one end.
 APART = 0.1
@@ -44,15 +44,15 @@ class TwinTuner:
     excess <= tolerance, in every window where the score has a profile, is solved on the simulated closed loop with the twin at its
     posterior mode plus the mean discrepancy (`Search`), from theta_0, ``pool`` Sobol points and the thetas tried so far. They are
     what a search from there finds with several sd of an ensemble held back (`CAUTION`), and envelope steps by these. Constrained log
-    expected improvement, on m corrected by the Gaussian process of what the trials left of it, picks one (`most_promising`).
+    expected improvement, on m corrected by the Gaussian process of what the trials left of it, picks one (`choose_candidate`).
     Further thetas of a batch, and those proposed beside running trials, are best on posterior draws. Deterministic: the same
     trials give the same thetas. Without a single trace the design is Sobol's.
 
-    Where the newest trial differs from what those before it foretold by `MISTAKEN` times what was expected or more, the twin
+    Where the newest trial differs from what those before it predicted_before by `MISTAKEN` times what was expected or more, the twin
     is no twin, and the black box `ConstrainedLogEI` proposes, with a warning. With ``safety`` it is the best trial that kept the
     limits again.
 
-    With ``safety`` the theta is one whose controller predicts the upper side of the belief: envelope steps (`covering`) on mean
+    With ``safety`` the theta is one whose controller predicts the upper side of the ensemble: envelope steps (`covering`) on mean
     plus some sd of an ensemble of plants. Candidates are those that keep every limit on a share of the ensemble of at least the
     stated probability, and the same acquisition picks; the first theta is the declared start, or the most cautious corner. What is
     proposed has to keep them as surely on an ensemble that nothing was chosen by. Where
@@ -89,13 +89,13 @@ class TwinTuner:
             safe = self._safe_ask(space, done, self.safety).thetas(n + len(running))
             fresh = [theta for theta in safe if not any(np.array_equal(theta, other) for other in running)] or safe
             return np.array([fresh[i % len(fresh)] for i in range(n)])
-        belief = believe(self.loop, trials) if trials else None
-        if belief is None or belief.discrepancy is None:
+        ensemble = condition(self.loop, trials) if trials else None
+        if ensemble is None or ensemble.discrepancy is None:
             out = initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)
             return out[:n]
-        if belief.mistaken:
+        if ensemble.mistaken:
             warnings.warn(
-                f"the twin did not foresee the last trial (off by {belief.mistake:.0f} times what it allows for): "
+                f"the twin did not foresee the last trial (off by {ensemble.standardised_error:.0f} times what it allows for): "
                 "this proposal is the black box's",
                 RuntimeWarning,
                 stacklevel=2,
@@ -104,14 +104,14 @@ class TwinTuner:
         first = self._points(space, trials)
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
-        drawn = [belief.plant(self._seed(trials) + k) for k in range(n if pending else n - 1)]
-        plants = drawn if pending else [belief.expected, *drawn]
+        drawn = [ensemble.plant(self._seed(trials) + k) for k in range(n if pending else n - 1)]
+        plants = drawn if pending else [ensemble.expected, *drawn]
         searches = [self._searched(Search(self.loop, plant, space), first) for plant in plants]
         thetas = [space.from_unit(search.best()) for search in searches]
         if pending:
             return np.array(thetas)
-        ask = Ask(self.loop, space, belief, trials, self._seed(trials))
-        best, _ = ask.most_promising(cautious(ask, thetas[0]))
+        ask = Proposal(self.loop, space, ensemble, trials, self._seed(trials))
+        best, _ = ask.choose_candidate(cautious(ask, thetas[0]))
         return np.array([best, *thetas[1:]])
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
@@ -122,18 +122,18 @@ class TwinTuner:
         plant under the inputs of that trial.
         """
         with threadpool_limits(1):
-            belief = believe(self.loop, trials)
-            if belief.discrepancy is None:
+            ensemble = condition(self.loop, trials)
+            if ensemble.discrepancy is None:
                 return None
-            ask = Ask(self.loop, space, belief, trials, self._seed(trials))
+            ask = Proposal(self.loop, space, ensemble, trials, self._seed(trials))
             known = {k: ask.tried(t) for k, t in enumerate(trials) if t.score is not None}
             return max(known, key=lambda k: _rank(known[k], LIKELY), default=None)
 
-    def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeAsk:
-        belief = believe(self.loop, trials, SURE, SURE_UNPROVED)
+    def _safe_ask(self, space: ParameterSpace, trials: Sequence[TrialLike], safety: Safety) -> SafeProposal:
+        ensemble = condition(self.loop, trials, SURE, SURE_UNPROVED)
         # While nothing is known a start is judged by the same plants each time: other ones could pass by chance what these refused.
-        seed = self.seed if belief.discrepancy is None else self._seed(trials)
-        return SafeAsk(self.loop, space, belief, trials, seed, safety, self.steps)
+        seed = self.seed if ensemble.discrepancy is None else self._seed(trials)
+        return SafeProposal(self.loop, space, ensemble, trials, seed, safety, self.steps)
 
     def _seed(self, trials: Sequence[TrialLike]) -> int:
         return self.seed + 7919 * len(trials)
@@ -154,7 +154,7 @@ class TwinTuner:
         return search
 
 
-def cautious(ask: Ask, theta: NDArray[np.float64]) -> list[Candidate]:
+def cautious(ask: Proposal, theta: NDArray[np.float64]) -> list[Candidate]:
     """From the best theta on the expected plant a search and steps that take back some sd; it too where none is likely to do."""
     start, out = ask.candidate(theta), []
     for deviations in CAUTION:

@@ -17,11 +17,11 @@ from chargetune.study.serialization import space_from_json
 from chargetune.study.store.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["Reading", "StudyView", "read_studies", "read_study"]
+__all__ = ["ReadStudy", "StudyView", "read_studies", "read_study"]
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadStudy:
     """A trial and its stored episode; without an episode ``message`` says why."""
 
     trial: Trial
@@ -87,7 +87,7 @@ class StudyView:
                 if trace is not None:
                     yield trial, Episode.from_arrays(*trace)
 
-    def readings(self, trials: Iterable[Trial]) -> Iterator[Reading]:
+    def readings(self, trials: Iterable[Trial]) -> Iterator[ReadStudy]:
         """Each of ``trials`` with its episode or the reason why there is none; nothing is raised for a single trace."""
         with Store(self.location, read_only=True) as store:
             record = store.study(self.name)
@@ -95,14 +95,14 @@ class StudyView:
                 try:
                     trace = None if trial.trace_sha256 is None else store.trace(record.id, trial.number)
                     if trace is None:
-                        yield Reading(trial, None, "no trace is stored")
+                        yield ReadStudy(trial, None, "no trace is stored")
                     else:
-                        yield Reading(trial, Episode.from_arrays(*trace), "")
+                        yield ReadStudy(trial, Episode.from_arrays(*trace), "")
                 except StoreError as error:
-                    yield Reading(trial, None, str(error))
+                    yield ReadStudy(trial, None, str(error))
                 except (KeyError, TypeError, ValueError) as error:
                     # A program may store arrays of its own with a trial.
-                    yield Reading(trial, None, f"the stored trace is not that of an episode ({error})")
+                    yield ReadStudy(trial, None, f"the stored trace is not that of an episode ({error})")
 
     def episode(self, trial: Trial | None) -> Episode | None:
         """The episode of one trial; None without trial or trace."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import casadi as ca
 
-__all__ = ["parametric"]
+__all__ = ["hoist"]
 
 
-def parametric(name: str, arguments: Sequence[Any], fixed: Sequence[Any], expressions: Sequence[Any]) -> tuple[ca.Function, ca.Function]:
+def hoist(name: str, arguments: Sequence[Any], fixed: Sequence[Any], expressions: Sequence[Any]) -> tuple[ca.Function, ca.Function]:
     """(arguments, q) -> expressions, and fixed -> q, for SX ``expressions`` of both: q is what they need of ``fixed``, shape (nq,).
 
     What two expressions share is one entry of q, because it is made one beforehand.

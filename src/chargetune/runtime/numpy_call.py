@@ -8,10 +8,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["evaluated"]
+__all__ = ["numpy_call"]
 
 
-def evaluated(function: ca.Function, *given: ArrayLike) -> list[NDArray[np.float64]]:
+def numpy_call(function: ca.Function, *given: ArrayLike) -> list[NDArray[np.float64]]:
     """The results of a function whose arguments and results are dense; other threads run meanwhile.
 
     All are transposed: CasADi stores columns one after the other, NumPy rows, so what is a column an interval there is a row an

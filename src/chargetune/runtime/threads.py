@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
-__all__ = ["each", "meanwhile", "usable_cores"]
+__all__ = ["parallel_map", "submit", "usable_cores"]
 
 Result = TypeVar("Result")
 
@@ -22,7 +22,7 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def each(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
+def parallel_map(function: Callable[..., Result], *arguments: Iterable[object]) -> list[Result]:
     """``list(map(function, *arguments))``, in as many threads as there are cores; the first exception is raised.
 
     Called from one of these threads it goes on in that thread: one that waited for the others could wait for ever.
@@ -32,8 +32,8 @@ def each(function: Callable[..., Result], *arguments: Iterable[object]) -> list[
     return list(_threads(usable_cores(), os.getpid()).map(function, *arguments))
 
 
-def meanwhile(function: Callable[..., Result], *arguments: object) -> Future[Result]:
-    """Begins ``function(*arguments)`` in one of the threads of `each` and returns at once; ``result()`` waits for what it returns.
+def submit(function: Callable[..., Result], *arguments: object) -> Future[Result]:
+    """Begins ``function(*arguments)`` in one of the threads of `parallel_map` and returns at once; ``result()`` waits for what it returns.
 
     From one of these threads it is what ``result()`` is ready with: the others may all wait for this one.
     """

@@ -21,7 +21,7 @@ from starlette.types import ASGIApp
 from chargetune.report.page.html import plotly_js, static
 from chargetune.report.page.plot_data import trial_drawing
 from chargetune.report.page.trial_rows import theta_document, trace_csv
-from chargetune.report.study_view import Reading, StudyView
+from chargetune.report.study_view import ReadStudy, StudyView
 from chargetune.study.store.store import StoreError
 from chargetune.study.trial import Trial
 from chargetune.web.events import Ending, list_events, study_events
@@ -117,7 +117,7 @@ async def _trial(watch: StoreWatch, request: Request) -> tuple[StudyView, Trial]
     return view, found
 
 
-async def _reading(watch: StoreWatch, request: Request) -> tuple[StudyView, Reading]:
+async def _reading(watch: StoreWatch, request: Request) -> tuple[StudyView, ReadStudy]:
     view, found = await _trial(watch, request)
     return view, await asyncio.to_thread(lambda: next(view.readings([found])))
 

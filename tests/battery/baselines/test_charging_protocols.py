@@ -14,7 +14,7 @@ from chargetune.battery.charging.metrics import crossing_minutes
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.plants.electrochemical import Electrochemical
-from chargetune.battery.plants.steppable import triable
+from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
@@ -26,7 +26,7 @@ VOLTAGE = Limit("voltage_max_V", 4.2, 5e-4)
 
 
 def circuit(soc=0.05, cell=CELL):
-    return triable(SimulatedPlant(ecm_model(cell, 10.0), start_state(cell, soc)))
+    return as_steppable(SimulatedPlant(ecm_model(cell, 10.0), start_state(cell, soc)))
 
 
 def minutes(episode, mark, soc_start=0.05):
@@ -79,7 +79,7 @@ def test_step_laws_by_hand():
 
 
 def test_a_law_below_zero_charges_nothing():
-    plant = triable(Electrochemical(model="SPM").plant(0.9, 10.0, Sensors()))
+    plant = as_steppable(Electrochemical(model="SPM").plant(0.9, 10.0, Sensors()))
     episode = charge(plant, constant_current(-15.0), [], steps=2, soc_target=1.0, current_max_A=15.0)
     assert episode.ending is Ending.DONE
     np.testing.assert_array_equal(episode.input, 0.0)
@@ -89,7 +89,7 @@ def test_a_law_below_zero_charges_nothing():
 # independent study with the same limits, held by bisection.
 def test_cccv_on_the_dfn():
     current, t80, t90, anode_mV, highest_K = 10.0, 24.3, 31.7, -7.2, 327.0
-    plant = triable(Electrochemical().plant(0.05, 10.0, Sensors()))
+    plant = as_steppable(Electrochemical().plant(0.05, 10.0, Sensors()))
     steps = round(6 * t90) + 12
     episode = charge(plant, constant_current(current), [VOLTAGE], steps=steps, soc_target=1.0, current_max_A=current)
     assert minutes(episode, 0.8) == pytest.approx(t80, rel=0.03)

@@ -10,7 +10,7 @@ import pytest
 
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.certification.certificate import figures, run_charges, write_certificate
-from chargetune.battery.certification.variations import Spread, Variations
+from chargetune.battery.certification.variations import PlantVariation, Variations
 from chargetune.battery.charging.problem import Backoff, ChargingProblem
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.episode.episode import Ending
@@ -21,8 +21,8 @@ from chargetune.verify import upper_bound, verify
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 CELL = default_cell()
-NONE = Spread(0, 0, 0, 0, 0, 0)
-MODEST = Spread(soc_start=0.1, resistance=0.002, growth=0.0)
+NONE = PlantVariation(0, 0, 0, 0, 0, 0)
+MODEST = PlantVariation(soc_start=0.1, resistance=0.002, growth=0.0)
 ONLY_START = replace(NONE, soc_start=0.1)
 THETA = (0.0, 0.0)
 
@@ -97,9 +97,9 @@ def test_quantiles_by_hand():
 
 
 def test_draws_are_within_the_spread_and_depend_on_seed_and_index_alone():
-    spread, problem = Spread(), forced()
+    spread, problem = PlantVariation(), forced()
     drawn = [spread.draw(problem, 3, index) for index in range(500)]
-    assert drawn[7] == Spread().draw(problem, 3, 7) != Spread().draw(problem, 4, 7)
+    assert drawn[7] == PlantVariation().draw(problem, 3, 7) != PlantVariation().draw(problem, 4, 7)
     start = np.array([d.soc_start for d in drawn])
     age = np.array([d.age for d in drawn])
     r0, capacity = (np.array([d.factors[name] for d in drawn]) for name in ("R0_ohm", "capacity_Ah"))
@@ -119,7 +119,7 @@ def test_draws_are_within_the_spread_and_depend_on_seed_and_index_alone():
 
 def test_the_drawn_plant_differs_and_the_controller_does_not_know():
     problem = forced(current_min_A=0.0, steps=60)
-    draw = Spread().draw(problem, 0, 0)
+    draw = PlantVariation().draw(problem, 0, 0)
     harder = replace(draw, soc_start=0.6, factors={**dict.fromkeys(draw.factors, 1.0), "R0_ohm": 1.2})
     same = replace(harder, factors=dict.fromkeys(draw.factors, 1.0))
     variations = Variations(problem)
@@ -142,7 +142,7 @@ def test_an_electrochemical_plant_is_varied_and_another_is_refused():
         Variations(forced(plant_model=object()))
     # A single particle that is charged for half a minute.
     problem = forced(plant_model=Electrochemical("SPM"), steps=3, current_min_A=0.0, kalman=None)
-    one = Spread().draw(problem, 0, 0)
+    one = PlantVariation().draw(problem, 0, 0)
     plain, smaller, harder = (
         Variations(problem).run(replace(one, soc_start=0.5, factors={**dict.fromkeys(one.factors, 1.0), **factors}), THETA)[1]
         for factors in ({}, {"capacity_Ah": 0.8}, {"R0_ohm": 1.5})
@@ -165,7 +165,7 @@ def test_nothing_to_draw_is_refused():
 )
 def test_a_bad_spread_is_refused(changes, words):
     with pytest.raises(ValueError, match=f"spread: {words}"):
-        Spread(**changes)
+        PlantVariation(**changes)
 
 
 @pytest.fixture
@@ -290,7 +290,7 @@ def test_each_start_that_may_be_drawn_is_charged(changes, width):
 
 def test_the_drawn_start_is_scored_from_there():
     problem = forced(current_min_A=0.0, steps=60, backoff=Backoff(nodes=2, upper_V=0.02))
-    draw = Spread().draw(problem, 0, 0)
+    draw = PlantVariation().draw(problem, 0, 0)
     draw = replace(draw, soc_start=0.75, factors=dict.fromkeys(draw.factors, 1.0))
     score, episode = Variations(problem).run(draw, THETA)
     same = replace(problem, soc_start=0.75)

@@ -120,7 +120,7 @@ def test_a_theta_declared_safe_has_to_be_safe():
     assert check_charging(study, start=[0.2, 0.2, 0.2], quick=True) == ()
     (found,) = check_charging(study, start=[0.0, 0.0, 0.0], quick=True)
     assert (found.code, found.severity) == ("unsafe-start", "error")
-    # Case study, section 4: untuned this controller is 62 mV over the limit; told in tolerances.
+    # Member study, section 4: untuned this controller is 62 mV over the limit; told in tolerances.
     assert study.tolerance_V * (1 + found.numbers["excess"]) == pytest.approx(0.062, abs=1e-3)
 
 

@@ -71,7 +71,7 @@ def test_the_time_of_charge_ends_above_the_start(value):
         problem(charge_time_to_soc=value)
 
 
-# Case study, section 4: untuned overshoot in mV and t95 in minutes.
+# Member study, section 4: untuned overshoot in mV and t95 in minutes.
 UNTUNED = {0: (38, 39.7), 1: (62, 35.8), 2: (45, 34.5), 3: (113, 37.4), 4: (42, 41.7), 5: (95, 31.8), 6: (58, 37.8), 7: (94, 41.1)}
 
 

@@ -12,7 +12,7 @@ from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.identification.anode import with_anode
-from chargetune.battery.plants.steppable import triable
+from chargetune.battery.plants.steppable import as_steppable
 from chargetune.plants.simulated import SimulatedPlant
 
 TRUE = replace(
@@ -24,7 +24,7 @@ LIMIT = Limit("voltage_max_V", 4.2, 0.0)
 
 
 def charged(current, cell=TRUE):
-    plant = triable(SimulatedPlant(ecm_model(cell, 30.0), start_state(cell, 0.02)))
+    plant = as_steppable(SimulatedPlant(ecm_model(cell, 30.0), start_state(cell, 0.02)))
     return charge(plant, constant_current(current), [LIMIT], steps=int(1.2 * 240 / current), soc_target=1.0, current_max_A=current)
 
 

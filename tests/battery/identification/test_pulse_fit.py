@@ -18,7 +18,7 @@ from chargetune.battery.identification.pulses import find_pulse_sets, groups, se
 from chargetune.battery.identification.record import Record, checked
 from chargetune.battery.identification.thermal import activation_energy, with_thermal
 from chargetune.battery.identification.virtual_bench import pulse_test, record_csv, slow_cycle
-from chargetune.battery.plants.steppable import triable
+from chargetune.battery.plants.steppable import as_steppable
 from chargetune.plants.simulated import SimulatedPlant
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -33,7 +33,7 @@ TWO = replace(TRUE, C1_F=(200.0,) * 3, R2_ohm=(0.015,) * 3, C2_F=(2500.0,) * 3)
 
 def measured(cell, *, pulse_s=60.0, points=6, voltage_min_V=2.6):
     def sampled(seconds):
-        return triable(SimulatedPlant(ecm_model(cell, seconds), start_state(cell, 1.0)))
+        return as_steppable(SimulatedPlant(ecm_model(cell, seconds), start_state(cell, 1.0)))
 
     return pulse_test(sampled, capacity_Ah=cell.capacity_Ah, voltage_min_V=voltage_min_V, points=points, pulse_s=pulse_s)
 
@@ -53,7 +53,7 @@ def test_a_known_circuit_comes_back(cell, rc):
 def test_a_slow_cycle_tells_the_ocv_from_empty_to_full():
     """Against the table of the circuit it ran on; it ends as full as it began, because the current falls at the limit."""
     cell = default_cell()
-    plant = triable(SimulatedPlant(ecm_model(cell, 60.0), start_state(cell, 1.0)))
+    plant = as_steppable(SimulatedPlant(ecm_model(cell, 60.0), start_state(cell, 1.0)))
     slow = slow_cycle(plant, capacity_Ah=cell.capacity_Ah, voltage_min_V=cell.ocv_V[0], voltage_max_V=4.2)
     assert slow.charge_Ah[-1] == pytest.approx(0.0, abs=2e-3 * cell.capacity_Ah)
     found = identify(measured(cell), ocv=slow, capacity_Ah=cell.capacity_Ah).cell
@@ -98,7 +98,7 @@ def test_pulses_and_rests_are_found():
 
 def several_rates(cell, noise_V):
     """Three sets of pulses of three currents at each of six SOC, with 20 minutes of rest between them."""
-    plants = {seconds: triable(SimulatedPlant(ecm_model(cell, seconds), start_state(cell, 1.0))) for seconds in (0.5, 10.0, 60.0)}
+    plants = {seconds: as_steppable(SimulatedPlant(ecm_model(cell, seconds), start_state(cell, 1.0))) for seconds in (0.5, 10.0, 60.0)}
     state, rows = plants[0.5].start, [(0.0, 0.0, 0.0)]
     for _ in range(6):
         pulses = [part for rate in (1, 2, 3) for part in ((0.5, -rate, 10), (0.5, 0, 40), (0.5, 0.75 * rate, 10), (60.0, 0, 1200))]

@@ -162,10 +162,10 @@ def test_windows_far_from_their_limit_are_left_out():
 def test_the_objective_is_the_time_of_the_lap_and_stays_finite():
     data = _Data.of(Track(), SPACE, tuned(Composite(Track(), n_initial=3), 4))
     with reproducible(0):
-        belief = _Belief(data)
+        ensemble = _Belief(data)
         speed = torch.tensor([[1.0, 2.0, 1.5, 0.8, 2.0, 1.0, 1.0, 3.0]])
-        assert float(belief.objective(speed)) == pytest.approx(-float((1 / speed).sum()), rel=2e-2)
-        stuck = belief.objective(torch.tensor([[-1.0] * WINDOWS]))
+        assert float(ensemble.objective(speed)) == pytest.approx(-float((1 / speed).sum()), rel=2e-2)
+        stuck = ensemble.objective(torch.tensor([[-1.0] * WINDOWS]))
     assert torch.isfinite(stuck).all()
     assert float(stuck) < -Track().duration_s
 

@@ -124,14 +124,14 @@ def test_tolerance_zero_works():
 
 
 class Rough(AcquisitionFunction):
-    """Finite everywhere, and where it is to be improved without a gradient, or of a mistake in the program."""
+    """Finite everywhere, and where it is to be improved without a gradient, or of a standardised_error in the program."""
 
     def __init__(self, failure):
         super().__init__(GaussianProcess().fit(X, Y[:, 0]))
         self.failure = failure
 
     def forward(self, x):
-        if x.requires_grad and self.failure == "mistake":
+        if x.requires_grad and self.failure == "standardised_error":
             raise RuntimeError("shapes do not fit")
         return x[:, 0, 0] + (0.0 * x).sum(-1).sum(-1).sqrt()
 
@@ -143,7 +143,7 @@ def test_a_search_that_fails_is_warned_of_and_a_mistake_is_none_of_its_failures(
             found = maximise(Rough("gradient"), points, X.numpy())
         assert found[0] == points[:, 0].max()
         with pytest.raises(RuntimeError, match="shapes do not fit"):
-            maximise(Rough("mistake"), points, X.numpy())
+            maximise(Rough("standardised_error"), points, X.numpy())
 
 
 def test_where_no_trial_keeps_the_limits_the_incumbent_is_the_closest_in_tolerances():

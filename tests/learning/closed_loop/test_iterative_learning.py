@@ -1,4 +1,4 @@
-"""Envelope steps: slopes against finite differences, what they reach on exact plants, and the tuner under noise."""
+"""IterativeLearning steps: slopes against finite differences, what they reach on exact plants, and the tuner under noise."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.tunables import LimitBackoff
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.learning import Envelope
+from chargetune.learning import IterativeLearning
 from chargetune.learning.closed_loop.covering import _rolled, covering, predicted_rows
 from chargetune.plants.sensors import Sensors
 
@@ -134,7 +134,7 @@ def test_what_no_sample_asks_for_stays():
 def test_the_tuner_learns_under_noise_without_a_model_of_the_plant():
     noisy = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}), verdict_samples=5)
     exact = replace(noisy, sensors=Sensors())
-    tuner, trials = Envelope(ChargingTwin(noisy)), []
+    tuner, trials = IterativeLearning(ChargingTwin(noisy)), []
     for number in range(4):
         theta = tuner.ask(noisy.space, trials)[0]
         score, episode, _ = noisy(theta, number)
@@ -150,10 +150,10 @@ def test_a_trace_with_holes_is_bridged():
     episode = problem.episode()
     holes = episode.output_start.copy()
     holes[::4, 0] = np.nan
-    theta = Envelope(ChargingTwin(problem)).ask(
+    theta = IterativeLearning(ChargingTwin(problem)).ask(
         problem.space, [trial(0, problem.space.default, None, replace(episode, output_start=holes))]
     )[0]
-    whole = Envelope(ChargingTwin(problem)).ask(problem.space, [trial(0, problem.space.default, None, episode)])[0]
+    whole = IterativeLearning(ChargingTwin(problem)).ask(problem.space, [trial(0, problem.space.default, None, episode)])[0]
     assert np.all(np.isfinite(theta))
     np.testing.assert_allclose(theta, whole, atol=0.15)
 
@@ -163,7 +163,7 @@ def test_a_trace_with_holes_is_bridged():
 )
 def test_nonsense_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match="envelope") as caught:
-        Envelope(ChargingTwin(charge(ratios=(ResistanceRatio("R0"),))), **given)
+        IterativeLearning(ChargingTwin(charge(ratios=(ResistanceRatio("R0"),))), **given)
     assert said in str(caught.value)
 
 

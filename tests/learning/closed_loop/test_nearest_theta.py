@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.nearest_theta import GAIN, _LeastDistance, nearest
 from chargetune.learning.closed_loop.search import Search
-from chargetune.learning.closed_loop.slp import Lines, Point, corner
+from chargetune.learning.closed_loop.slp import Linearisation, Point, solve_slp
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 SPACE = ParameterSpace((Parameter("speed", 0.0, 2.0, 1.0, size=2), Parameter("unused", -4.0, 4.0, 0.0, size=3)))
@@ -108,7 +108,7 @@ def towards(to, start, row):
     def points(us):
         return [Point(1.0 + (float(u[0]) - to) ** 2 / whole**2, np.array([row(float(u[0]))])) for u in us]
 
-    return float(corner(points, np.array([start]), 8, 0.01, 0.01, _LeastDistance(np.array([to]), whole))[0])
+    return float(solve_slp(points, np.array([start]), 8, 0.01, 0.01, _LeastDistance(np.array([to]), whole))[0])
 
 
 def test_limits_that_are_broken_on_the_way_and_not_at_its_end_do_not_end_it():
@@ -151,7 +151,7 @@ def test_a_step_is_the_least_distance_within_the_lines(seed):
     draw = np.random.default_rng(seed)
     u, to, jacobian = draw.uniform(0.3, 0.7, 6), draw.uniform(0.0, 1.0, 6), draw.standard_normal((40, 6))
     # All are kept at u.
-    lines = Lines(u, -draw.uniform(0.0, 0.3, 40), np.zeros(6), jacobian)
+    lines = Linearisation(u, -draw.uniform(0.0, 0.3, 40), np.zeros(6), jacobian)
     step, left = _LeastDistance(to, 0.7).step(lines, 0.25, price=1e3)
     low, high = lines.room(0.25)
     kept = {"type": "ineq", "fun": lambda d: -lines.rows - jacobian @ d, "jac": lambda d: -jacobian}
@@ -167,7 +167,7 @@ def test_a_step_is_the_least_distance_within_the_lines(seed):
 
 def test_where_lines_cannot_be_kept_the_violation_has_its_price():
     # d <= -0.3 and a radius of 0.1: at a high price as far as may be, for nothing not at all.
-    lines = Lines(np.array([0.5]), np.array([0.3]), np.zeros(1), np.array([[1.0]]))
+    lines = Linearisation(np.array([0.5]), np.array([0.3]), np.zeros(1), np.array([[1.0]]))
     for price, d in ((100.0, -0.1), (1e-6, 0.1)):
         step, left = _LeastDistance(np.array([0.9]), 1.0).step(lines, 0.1, price)
         assert step == pytest.approx(d, abs=1e-6)

@@ -99,7 +99,7 @@ def test_a_charge_that_rides_its_limit_is_searched_at_every_sample():
 
     found = Search(loop, simulate, problem.space, share=0.4)
     found.envelope(np.ones(9), 6)
-    # Envelope steps know nothing of the time, and with the largest sample of each window in place of all samples this is the end.
+    # IterativeLearning steps know nothing of the time, and with the largest sample of each window in place of all samples this is the end.
     assert found.score(found.best()).metrics["t95_min"] > 42.0
     found.refine(found.best(), 8, 1e-3)
     metrics = found.score(found.best()).metrics

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from chargetune.learning.closed_loop.slp import Lines, Point, _Linear, corner
+from chargetune.learning.closed_loop.slp import Linearisation, Point, _Linear, solve_slp
 
 
 class Counted:
-    """f and c as what `corner` evaluates; ``points`` are all that it asked for."""
+    """f and c as what `solve_slp` evaluates; ``points`` are all that it asked for."""
 
     def __init__(self, objective, rows, known=lambda u: True):
         self.objective, self.rows, self.known, self.points = objective, rows, known, []
@@ -34,7 +34,7 @@ def bent(u):
 def test_along_many_limits_to_the_one_that_matters(start, way):
     # Also from where all of them are broken.
     way = np.array(way)
-    found = corner(Counted(lambda u: -1.0 - way @ u, circle), np.array(start), 30, 1e-6)
+    found = solve_slp(Counted(lambda u: -1.0 - way @ u, circle), np.array(start), 30, 1e-6)
     expected = 0.5 + 0.4 * way / np.linalg.norm(way)
     assert np.max(circle(found)) <= 1e-6
     assert way @ found == pytest.approx(way @ expected, abs=1e-4)
@@ -43,7 +43,7 @@ def test_along_many_limits_to_the_one_that_matters(start, way):
 @pytest.mark.parametrize("seed", range(5))
 def test_at_a_corner_it_arrives_in_few_steps(seed):
     problem = Counted(lambda u: -1.0 - u.sum(), bent)
-    found = corner(problem, np.random.default_rng(seed).uniform(0.1, 0.4, 11), 20, 1e-6)
+    found = solve_slp(problem, np.random.default_rng(seed).uniform(0.1, 0.4, 11), 20, 1e-6)
     np.testing.assert_allclose(found, 0.5, rtol=0, atol=1e-4)
     # Twelve an iteration and what is corrected: eight to eleven iterations.
     assert len(problem.points) < 150
@@ -56,7 +56,7 @@ def test_along_a_bent_edge_steps_are_corrected_instead_of_shortened():
         return 1000.0 * np.array([u[1] - middle - 0.002, middle - u[1] - 0.002])
 
     problem = Counted(lambda u: 2.0 - u[0], edge)
-    found = corner(problem, np.array([0.3, 0.1]), 100, 1e-5)
+    found = solve_slp(problem, np.array([0.3, 0.1]), 100, 1e-5)
     # Where the edge leaves the cube: 0.1 + 3 (u_0 - 0.3)^2 = 1.002.
     np.testing.assert_allclose(found, [0.3 + np.sqrt(0.902 / 3.0), 1.0], rtol=0, atol=1e-3)
     # Without corrections 400 points lead half of the way.
@@ -65,23 +65,23 @@ def test_along_a_bent_edge_steps_are_corrected_instead_of_shortened():
 
 def test_what_no_point_keeps_is_broken_as_little_as_can_be():
     # No u has u_0 <= -0.5: at u_0 = 0 it is broken least, and that is paid for with all of the objective.
-    found = corner(Counted(lambda u: 1.0 - 0.01 * u[0] + u[1], lambda u: [u[0] + 0.5]), np.array([0.9, 0.1]), 30, 1e-6)
+    found = solve_slp(Counted(lambda u: 1.0 - 0.01 * u[0] + u[1], lambda u: [u[0] + 0.5]), np.array([0.9, 0.1]), 30, 1e-6)
     np.testing.assert_allclose(found, [0.0, 0.0], rtol=0, atol=1e-3)
 
 
 def test_a_limit_that_is_worth_more_than_its_price_is_kept_nevertheless():
     # One unit of the limit is worth a hundred times the objective, which is its price at first.
-    found = corner(Counted(lambda u: 1.0 - 100.0 * u[0], lambda u: [u[0] - 0.3]), np.array([0.1, 0.5]), 30, 1e-6)
+    found = solve_slp(Counted(lambda u: 1.0 - 100.0 * u[0], lambda u: [u[0] - 0.3]), np.array([0.1, 0.5]), 30, 1e-6)
     assert found[0] == pytest.approx(0.3, abs=1e-4)
 
 
 def test_where_nothing_is_known_is_not_gone():
     problem = Counted(lambda u: 2.0 - u[0] - u[1], lambda u: [u[1] - 0.6], known=lambda u: u[0] <= 0.8)
-    found = corner(problem, np.array([0.2, 0.2]), 60, 1e-6)
+    found = solve_slp(problem, np.array([0.2, 0.2]), 60, 1e-6)
     assert found[0] <= 0.8
     np.testing.assert_allclose(found, [0.8, 0.6], rtol=0, atol=0.01)
     start = np.array([0.9, 0.2])
-    np.testing.assert_array_equal(corner(problem, start, 60, 1e-6), start)
+    np.testing.assert_array_equal(solve_slp(problem, start, 60, 1e-6), start)
 
 
 @pytest.mark.parametrize("most", [0.6, 0.8, 2.0])
@@ -90,7 +90,7 @@ def test_along_a_bent_valley_it_comes_nearly_as_far_as_slsqp(most):
     def valley(u):
         return 1.0 + 10.0 * (u[1] - u[0] ** 2) ** 2 + (1.0 - u[0]) ** 2
 
-    found = corner(Counted(valley, lambda u: [u[0] - most]), np.array([0.1, 0.8]), 100, 1e-6)
+    found = solve_slp(Counted(valley, lambda u: [u[0] - most]), np.array([0.1, 0.8]), 100, 1e-6)
     other = minimize(
         valley,
         [0.1, 0.8],
@@ -105,14 +105,14 @@ def test_along_a_bent_valley_it_comes_nearly_as_far_as_slsqp(most):
 def test_with_a_gain_it_ends_where_less_is_promised():
     start = np.random.default_rng(0).uniform(0.1, 0.4, 11)
     whole, short = (Counted(lambda u: -1.0 - u.sum(), bent) for _ in range(2))
-    most, enough = corner(whole, start, 20, 1e-9), corner(short, start, 20, 1e-2)
+    most, enough = solve_slp(whole, start, 20, 1e-9), solve_slp(short, start, 20, 1e-2)
     assert len(short.points) < len(whole.points)
     assert enough.sum() >= most.sum() - 2e-2 * (1.0 + most.sum())
 
 
 def test_every_point_is_within_the_cube():
     problem = Counted(lambda u: 1.0 - u.sum(), lambda u: [u[0] - 2.0])
-    found = corner(problem, np.array([0.95, 0.2, 1.0]), 30, 1e-6)
+    found = solve_slp(problem, np.array([0.95, 0.2, 1.0]), 30, 1e-6)
     np.testing.assert_allclose(found, 1.0, rtol=0, atol=1e-9)
     assert np.all(np.abs(np.array(problem.points) - 0.5) <= 0.5 + 1e-9)
 
@@ -124,7 +124,7 @@ def test_what_is_broken_by_no_more_than_counts_as_kept_is_no_reason_to_go_on():
 
     whole, short = (Counted(lambda u: 1.0, limits) for _ in range(2))
     start = np.array([0.9, 0.5])
-    most, enough = corner(whole, start, 60, 1e-6), corner(short, start, 60, 1e-6, kept=0.2)
+    most, enough = solve_slp(whole, start, 60, 1e-6), solve_slp(short, start, 60, 1e-6, kept=0.2)
     assert limits(most)[0] <= 1e-5
     assert 0.01 < limits(enough)[0] <= 0.2
     assert len(short.points) < len(whole.points)
@@ -132,7 +132,7 @@ def test_what_is_broken_by_no_more_than_counts_as_kept_is_no_reason_to_go_on():
 
 def test_a_linear_program_without_a_solution_is_warned_of_and_no_step():
     """From a point outside the cube no short step leads into it."""
-    lines = Lines(np.array([1.5]), np.array([0.3, -0.1]), np.ones(1), np.ones((2, 1)))
+    lines = Linearisation(np.array([1.5]), np.array([0.3, -0.1]), np.ones(1), np.ones((2, 1)))
     with pytest.warns(RuntimeWarning, match="a linear program of 2 rows failed"):
         step, left = _Linear().step(lines, 0.15, 1.0)
     np.testing.assert_array_equal(step, [0.0])

@@ -14,9 +14,9 @@ from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning.black_box.gaussian_process import SurrogateWarning
-from chargetune.learning.twin.calibration import SCALES, scale_of
+from chargetune.learning.twin.calibration import SCALES, calibrate_scale
 from chargetune.learning.twin.discrepancy import LENGTH, Discrepancy, _fit, _Part
-from chargetune.learning.twin.ensemble import believe
+from chargetune.learning.twin.ensemble import condition
 from chargetune.plants.sensors import Sensors
 
 CELL = default_cell()
@@ -36,7 +36,7 @@ def told(episode):
 
 def beliefs(problem, ratios):
     episodes = [problem.episode(np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
-    return believe(ChargingTwin(problem), [told(e) for e in episodes]), episodes
+    return condition(ChargingTwin(problem), [told(e) for e in episodes]), episodes
 
 
 def gap(episode, name, where):
@@ -48,9 +48,9 @@ def gap(episode, name, where):
     return replace(episode, **changed)
 
 
-def drawn_voltages(belief, episode, count=48):
+def drawn_voltages(ensemble, episode, count=48):
     """Voltages at the recorded input of an episode on drawn plants, shape (count, K, 2)."""
-    replayed = belief.replayed(episode, count, 3).episodes
+    replayed = ensemble.replayed(episode, count, 3).episodes
     return np.array([np.stack(e.signal("voltage_V"), axis=1) for e in replayed])
 
 
@@ -60,9 +60,9 @@ def test_intervals_cover_the_next_trial(pairs):
     covered = []
     for seed in range(4):
         problem = charge(seed, pairs=pairs)
-        belief, _ = beliefs(problem, (4.0, 2.0))
+        ensemble, _ = beliefs(problem, (4.0, 2.0))
         following = problem.episode(np.full(9, 1.6), 10)
-        voltages = drawn_voltages(belief, following)
+        voltages = drawn_voltages(ensemble, following)
         spread = np.sqrt(voltages.var(axis=0) + 0.002**2)
         measured = np.stack(following.signal("voltage_V"), axis=1)
         covered.append(np.mean(np.abs(measured - voltages.mean(axis=0)) < 1.645 * spread))
@@ -70,33 +70,35 @@ def test_intervals_cover_the_next_trial(pairs):
 
 
 def test_what_was_measured_is_reproduced_by_every_drawn_plant():
-    belief, episodes = beliefs(charge(pairs=True), (4.0, 1.6))
+    ensemble, episodes = beliefs(charge(pairs=True), (4.0, 1.6))
     true = np.stack(episodes[-1].signal("voltage_V", true=True), axis=1)
-    off = np.sqrt(np.mean((drawn_voltages(belief, episodes[-1], 8) - true) ** 2, axis=(1, 2)))
+    off = np.sqrt(np.mean((drawn_voltages(ensemble, episodes[-1], 8) - true) ** 2, axis=(1, 2)))
     assert np.max(off) < 3.5e-3
 
 
 def test_a_sample_is_surer_where_something_was_measured():
-    belief, episodes = beliefs(charge(pairs=True), (4.0,))
-    near = drawn_voltages(belief, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(belief, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    ensemble, episodes = beliefs(charge(pairs=True), (4.0,))
+    near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
+    far = drawn_voltages(ensemble, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
     assert far > 3 * near
 
 
 def test_between_the_nodes_of_a_coarse_table_a_sample_is_as_sure():
     """With three features the nodes are far from what was measured, and every sampled plant has to pass through it all the same."""
-    belief, episodes = beliefs(charge(pairs=True, cell=WARM), (4.0,))
-    near = drawn_voltages(belief, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(belief, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
-    assert len(belief.loop.features) == 3
+    ensemble, episodes = beliefs(charge(pairs=True, cell=WARM), (4.0,))
+    near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
+    far = drawn_voltages(ensemble, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    assert len(ensemble.loop.features) == 3
     assert far > 20 * near
 
 
 def test_the_error_of_a_state_does_not_jump_with_the_input():
-    belief, _ = beliefs(charge(pairs=True, cell=WARM), (4.0,))
+    ensemble, _ = beliefs(charge(pairs=True, cell=WARM), (4.0,))
     tables = {
-        name: table.reshape(belief.discrepancy.lattice.counts)
-        for name, table in zip(belief.discrepancy.lattice.outputs, belief.discrepancy.error(belief.posterior.mode, 3).table, strict=True)
+        name: table.reshape(ensemble.discrepancy.lookup_table.counts)
+        for name, table in zip(
+            ensemble.discrepancy.lookup_table.outputs, ensemble.discrepancy.error(ensemble.posterior.mode, 3).table, strict=True
+        )
     }
     steps = {name: np.max(np.abs(np.diff(table, axis=1))) for name, table in tables.items()}
     assert steps["temperature_K"] < 1e-3 * np.ptp(tables["temperature_K"])
@@ -108,10 +110,10 @@ def test_a_temperature_at_its_limit_is_foretold():
     other = replace(CELL, thermal=Thermal(heat_capacity_J_K=38.0, cooling_W_K=0.13))
     problem = charge(pairs=False, cell=WARM, temperature_max_K=302.0, steps=240)
     problem = replace(problem, plant_model=AnotherCell(other))
-    belief, episodes = beliefs(problem, (1.0,))
+    ensemble, episodes = beliefs(problem, (1.0,))
     highest = np.max(episodes[0].signal("temperature_K")[1])
     assert abs(highest - 302.0) < 0.1
-    drawn = belief.predict(np.full(9, 1.0), 16, 0).episodes
+    drawn = ensemble.predict(np.full(9, 1.0), 16, 0).episodes
     np.testing.assert_allclose([np.max(e.signal("temperature_K")[1]) for e in drawn], highest, rtol=0, atol=0.05)
 
 
@@ -122,7 +124,7 @@ def test_a_gap_in_a_feature_is_bridged(name, seen):
     episode = problem.episode(np.full(9, 4.0), 0)
     holed = gap(episode, name, slice(100, 200) if seen else slice(None))
     whole, bridged = (
-        Discrepancy(believe(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
+        Discrepancy(condition(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
     )
     off = np.abs(bridged.signals(holed) - whole.signals(episode)) / [1.0, 6.0, 35.0]
     assert np.max(off) < 0.05
@@ -133,7 +135,7 @@ def test_a_feature_that_was_never_measured_is_named():
     problem = charge(cell=WARM)
     holed = gap(problem.episode(np.full(9, 4.0), 0), "soc", slice(None))
     with pytest.raises(ValueError, match="soc was never measured in an episode of"):
-        believe(ChargingTwin(problem), [told(holed)] * 2)
+        condition(ChargingTwin(problem), [told(holed)] * 2)
 
 
 def test_the_scale_grows_with_what_was_not_foretold():
@@ -141,7 +143,7 @@ def test_the_scale_grows_with_what_was_not_foretold():
     for pairs in (False, True):
         problem = charge(pairs=pairs)
         before, _ = beliefs(problem, (4.0,))
-        scales.append(scale_of([before.discrepancy.foretold(problem.episode(np.full(9, 1.6), 7))]))
+        scales.append(calibrate_scale([before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))]))
     assert scales[0] < 2.0 < scales[1]
 
 
@@ -149,11 +151,11 @@ def test_a_repeat_says_nothing_of_elsewhere():
     """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
     problem = charge(pairs=True)
     before, _ = beliefs(problem, (4.0, 1.6))
-    foretold = before.discrepancy.foretold(problem.episode(np.full(9, 1.6), 7))
-    assert foretold.mistake < 1.0
+    predicted_before = before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))
+    assert predicted_before.standardised_error < 1.0
     for sure in (0.5, 0.84):
         # ln s ~ N(0, 1) as before: its quantile, on a grid of 8 %.
-        assert scale_of([foretold], sure) == pytest.approx(np.exp(norm.ppf(sure)), rel=0.1)
+        assert calibrate_scale([predicted_before], sure) == pytest.approx(np.exp(norm.ppf(sure)), rel=0.1)
 
 
 def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
@@ -162,7 +164,7 @@ def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
     ratios = (4.0, 1.6, 1.6, 1.6, 1.6, 1.6)
     trials = [told(problem.episode(np.full(9, ratio), seed)) for seed, ratio in enumerate(ratios)]
     loop = ChargingTwin(problem)
-    scales = [believe(loop, trials[:n]).discrepancy.scale for n in (2, 6)]
+    scales = [condition(loop, trials[:n]).discrepancy.scale for n in (2, 6)]
     assert scales[0] > 2.0
     assert scales[1] > 0.7 * scales[0]
 
@@ -181,31 +183,31 @@ def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
     loop = ChargingTwin(problem)
     fits = []
     for n in (2, 3, 3):
-        belief = believe(loop, trials[:n])
-        fits.append(len(loop.twin.foretold))
+        ensemble = condition(loop, trials[:n])
+        fits.append(len(loop.twin.predicted_before))
     assert fits == [1, 2, 2]
     assert len(loop.twin.ways) == 3
     assert len(loop.twin.newest) == 1
-    fresh = believe(ChargingTwin(problem), trials)
-    assert fresh.discrepancy.scale == belief.discrepancy.scale
-    assert fresh.mistake == belief.mistake
-    np.testing.assert_array_equal(fresh.posterior.mode, belief.posterior.mode)
+    fresh = condition(ChargingTwin(problem), trials)
+    assert fresh.discrepancy.scale == ensemble.discrepancy.scale
+    assert fresh.standardised_error == ensemble.standardised_error
+    np.testing.assert_array_equal(fresh.posterior.mode, ensemble.posterior.mode)
 
 
 @pytest.mark.usefixtures("virtual_machine")
 def test_before_a_trial_was_foretold_errors_may_be_as_large_as_the_prior_of_the_scale_says():
     problem = charge(steps=60)
     trials = [told(problem.episode(np.full(9, 4.0), 1))]
-    scales = [believe(ChargingTwin(problem), trials, sure).discrepancy.scale for sure in (0.5, 0.84)]
+    scales = [condition(ChargingTwin(problem), trials, sure).discrepancy.scale for sure in (0.5, 0.84)]
     # The quantiles of exp(N(0, 1)) on a grid of 8 %.
     np.testing.assert_allclose(scales, [1.0, np.exp(norm.ppf(0.84))], rtol=0.08)
 
 
 @pytest.mark.usefixtures("virtual_machine")
 def test_features_are_one_to_three():
-    belief, episodes = beliefs(charge(steps=60), (4.0,))
+    ensemble, episodes = beliefs(charge(steps=60), (4.0,))
     with pytest.raises(ValueError, match="allowed are 1 to 3"):
-        Discrepancy(belief.posterior, tuple(episodes), {})
+        Discrepancy(ensemble.posterior, tuple(episodes), {})
 
 
 @pytest.mark.usefixtures("virtual_machine")
@@ -213,14 +215,14 @@ def test_features_are_one_to_three():
 def test_the_scale_is_inferred_of_what_it_is_applied_to(scale):
     """The variance that a scale is judged by is that of drawn errors with this scale: Monte Carlo, and through the table."""
     problem = charge(pairs=True, steps=90)
-    belief, _ = beliefs(problem, (4.0,))
+    ensemble, _ = beliefs(problem, (4.0,))
     episode = problem.episode(np.full(9, 1.6), 5)
     k = int(np.argmin(np.abs(SCALES - scale)))
-    scaled = belief.discrepancy.scaled(1.0).scaled(SCALES[k])
-    judged = belief.discrepancy.scaled(1.0)._off(episode).unmodelled[k, :, 0]
-    weights = scaled.lattice.weights(scaled._at(episode))
+    scaled = ensemble.discrepancy.scaled(1.0).scaled(SCALES[k])
+    judged = ensemble.discrepancy.scaled(1.0)._off(episode).unmodelled[k, :, 0]
+    weights = scaled.lookup_table.weights(scaled._at(episode))
     np.testing.assert_allclose(judged, scaled._parts[0].variance(weights), rtol=1e-6, atol=1e-14)
-    drawn = np.array([error.table[0] @ weights.T for error in scaled.errors(np.tile(belief.posterior.mode, (600, 1)), range(600))])
+    drawn = np.array([error.table[0] @ weights.T for error in scaled.errors(np.tile(ensemble.posterior.mode, (600, 1)), range(600))])
     np.testing.assert_allclose(np.sum(drawn.var(axis=0)), np.sum(judged), rtol=0.25)
 
 

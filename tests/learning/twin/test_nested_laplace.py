@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad, trapezoid
 
 from chargetune.learning import Twin, Uncertain
-from chargetune.learning.twin.nested_laplace import WIDTH, sections
+from chargetune.learning.twin.nested_laplace import WIDTH, nested_laplace
 from chargetune.learning.twin.posterior import Posterior
 from chargetune.model.model import Model, Signal
 
@@ -48,13 +48,13 @@ def laplace(loss, mode):
 
 def test_of_a_gaussian_there_is_nothing_to_say():
     loss, mode = Line(), np.array([0.3, -0.2, 0.1])
-    assert sections(loss, mode, laplace(loss, mode), [0, 1, 2]) == []
-    assert sections(loss, mode, laplace(loss, mode), []) == []
+    assert nested_laplace(loss, mode, laplace(loss, mode), [0, 1, 2]) == []
+    assert nested_laplace(loss, mode, laplace(loss, mode), []) == []
 
 
 def test_moments_are_those_of_quadrature():
     loss, mode = Bent(), np.zeros(3)
-    found = sections(loss, mode, laplace(loss, mode), [2, 0])
+    found = nested_laplace(loss, mode, laplace(loss, mode), [2, 0])
     assert sum(one.share for one in found) == pytest.approx(1.0)
 
     def density(x):
@@ -144,7 +144,7 @@ def test_draws_of_two_resistances_in_series_need_no_sections():
 
 def test_draws_are_reproducible_and_as_many_as_the_shares_say():
     loss, mode = Bent(), np.zeros(3)
-    shares = [one.share for one in sections(loss, mode, laplace(loss, mode), [0])]
+    shares = [one.share for one in nested_laplace(loss, mode, laplace(loss, mode), [0])]
     parts = tuple((share, SimpleNamespace(number=k)) for k, share in enumerate(shares))
     posterior = Posterior(None, mode, np.eye(3), np.zeros(1), np.ones(1), (), parts)
     drawn = [[part.number for part in posterior._parts(200, seed)] for seed in (1, 1, 2)]
@@ -164,7 +164,7 @@ class Single:
 
 def test_of_a_single_unknown_there_are_no_others_to_find():
     loss = Single()
-    found = sections(loss, np.zeros(1), np.eye(1), [0])
+    found = nested_laplace(loss, np.zeros(1), np.eye(1), [0])
     at, shares = np.array([one.mode[0] for one in found]), np.array([one.share for one in found])
     density = np.array([np.exp(-0.5 * loss.values([x])[0] ** 2) for x in at])
     np.testing.assert_allclose(shares, density / density.sum())

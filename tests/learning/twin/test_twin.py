@@ -13,12 +13,12 @@ from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
-from chargetune.learning.candidates import Ask
+from chargetune.learning.candidates import Proposal
 from chargetune.learning.twin import twin as twin_module
-from chargetune.learning.twin.ensemble import believe
-from chargetune.learning.twin.laplace import Misfit
+from chargetune.learning.twin.ensemble import condition
+from chargetune.learning.twin.laplace import NegativeLogPosterior
 from chargetune.learning.twin_tuner import cautious
 from chargetune.plants.sensors import Sensors
 
@@ -86,7 +86,7 @@ def test_plants_whose_drawing_was_begun_are_those_that_are_drawn_when_they_are_n
     episode = problem.episode(np.full(9, 2.5))
     trials = [SimpleNamespace(number=0, theta=(2.5,) * 9, status="done", score=problem.score(episode), episode=lambda: episode)]
     loop = ChargingTwin(problem)
-    begun, needed = believe(loop, trials), believe(loop, trials)
+    begun, needed = condition(loop, trials), condition(loop, trials)
     begun.draw(6, 1)
     drawn = begun.replayed(episode, 6, 1).episodes
     for one, other in zip(drawn, needed.replayed(episode, 6, 1).episodes, strict=True):
@@ -191,8 +191,8 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
     problem = ChargingProblem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, ratios=(ResistanceRatio("R0"),))
     loop = ChargingTwin(problem)
 
-    lattice = Lattice.over(loop.features, list(loop.twin.noise_sd))
-    warmer = SimpleNamespace(table=np.tile([[0.5 if name == "temperature_K" else 0.0] for name in lattice.outputs], lattice.size))
+    lookup_table = LookupTable.over(loop.features, list(loop.twin.noise_sd))
+    warmer = SimpleNamespace(table=np.tile([[0.5 if name == "temperature_K" else 0.0] for name in lookup_table.outputs], lookup_table.size))
     theta = problem.space.default
     predicted = loop.simulate([(theta, np.zeros(27), warmer)])[0]
     # The circuit of the twin is the controller's own: the plant without a mismatch.
@@ -280,9 +280,9 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
             SimpleNamespace(number=number, theta=tuple(theta * (1.0 + number)), status="done", score=score, episode=lambda e=episode: e)
         )
     tuner = TwinTuner(ChargingTwin(problem))
-    belief = believe(tuner.loop, trials)
-    chances = [predicted.probability() for _, predicted in cautious(Ask(tuner.loop, problem.space, belief, trials, 3), theta)]
-    assert belief.predict(theta, 64, 3).probability() < 0.1
+    ensemble = condition(tuner.loop, trials)
+    chances = [predicted.probability() for _, predicted in cautious(Proposal(tuner.loop, problem.space, ensemble, trials, 3), theta)]
+    assert ensemble.predict(theta, 64, 3).probability() < 0.1
     assert min(chances) >= 0.5
     assert np.mean(chances) > 0.8
 
@@ -295,7 +295,7 @@ def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first
         score, episode, _ = problem(theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
     tuner = TwinTuner(ChargingTwin(problem))
-    found = cautious(Ask(tuner.loop, problem.space, believe(tuner.loop, trials), trials, 3), theta)
+    found = cautious(Proposal(tuner.loop, problem.space, condition(tuner.loop, trials), trials, 3), theta)
     chances = [predicted.probability() for _, predicted in found]
     assert chances[0] < 0.5
     assert chances == sorted(chances, reverse=True)
@@ -341,7 +341,7 @@ def test_a_posterior_is_that_of_the_spread_that_it_states():
     episodes = [problem.episode(np.full(9, level), k) for k, level in enumerate((4.0, 2.0))]
     twin = twin_of(problem)
     posterior = twin.fit(episodes)
-    misfit = Misfit(twin, [(e.input, twin.measured(e)) for e in episodes], posterior.spread)
+    misfit = NegativeLogPosterior(twin, [(e.input, twin.measured(e)) for e in episodes], posterior.spread)
     slopes = misfit.slopes(np.linalg.solve(twin.prior_factor, posterior.mode))
     stated = twin.prior_factor @ np.linalg.inv(slopes.T @ slopes) @ twin.prior_factor.T
     np.testing.assert_allclose(posterior.covariance, stated, rtol=1e-5, atol=1e-9)

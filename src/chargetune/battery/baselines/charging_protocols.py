@@ -12,11 +12,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from chargetune.battery.charging.limits import Limit
-from chargetune.battery.plants.steppable import Stepped
+from chargetune.battery.plants.steppable import SteppablePlant
 from chargetune.episode.episode import Ending, Episode
 from chargetune.plants.plant import PlantError
 
-__all__ = ["ATTIA_RATES", "Law", "attia_fourth_rate", "charge", "constant_current", "four_step", "multi_step"]
+__all__ = ["ATTIA_RATES", "CurrentLaw", "attia_fourth_rate", "charge", "constant_current", "four_step", "multi_step"]
 
 # Shares of the largest current in four equal SOC windows up to 80 %, then 1C: the protocol that Attia et al., Nature 578
 # (2020) 397, doi 10.1038/s41586-020-1994-5, found best (4.8C-5.2C-5.2C-4.160C, then 1C), relative to its largest rate.
@@ -26,15 +26,15 @@ CURRENT_TOLERANCE = 1e-6
 
 
 # SOC -> largest current (A)
-Law = Callable[[float], float]
+CurrentLaw = Callable[[float], float]
 
 
-def constant_current(current_A: float) -> Law:
+def constant_current(current_A: float) -> CurrentLaw:
     """The CC of CC-CV."""
     return lambda _: current_A
 
 
-def multi_step(currents_A: Sequence[float]) -> Law:
+def multi_step(currents_A: Sequence[float]) -> CurrentLaw:
     """Constant currents in as many equal SOC windows."""
     return lambda soc: currents_A[min(int(len(currents_A) * max(soc, 0.0)), len(currents_A) - 1)]
 
@@ -47,12 +47,14 @@ def attia_fourth_rate(rates: Sequence[float], hours: float) -> float:
     return 1.0 / left
 
 
-def four_step(currents_A: Sequence[float], last_A: float) -> Law:
+def four_step(currents_A: Sequence[float], last_A: float) -> CurrentLaw:
     """Four currents in the SOC windows 0-20, 20-40, 40-60, 60-80 %, then ``last_A``."""
     return lambda soc: currents_A[min(int(5 * max(soc, 0.0)), 3)] if soc < 0.8 else last_A
 
 
-def charge(stepped: Stepped, law: Law, limits: Sequence[Limit], *, steps: int, soc_target: float, current_max_A: float) -> Episode:
+def charge(
+    stepped: SteppablePlant, law: CurrentLaw, limits: Sequence[Limit], *, steps: int, soc_target: float, current_max_A: float
+) -> Episode:
     """One charge: in each interval the largest current in [0, law] that keeps ``limits`` at both its ends.
 
     At the target the current is zero. Where not even zero current keeps the limits it is zero. The current is found by

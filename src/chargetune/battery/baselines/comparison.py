@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, Law, charge, constant_current, four_step, multi_step
+from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.tunables import Backoff
-from chargetune.battery.plants.steppable import triable
+from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
@@ -57,7 +57,7 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
     largest = problem.current_max_A or 0.0
     names = [f"CC-CV {share * largest:.3g} A" for share in CCCV_SHARES]
     names += ["multi-step CC", "four-step CC (Attia)", "plant oracle"]
-    if triable(problem.plant) is None:
+    if as_steppable(problem.plant) is None:
         names = []
     names += ["nominal MPC", "best constant backoff"]
     if problem.plant_model is None:
@@ -102,8 +102,8 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
     return table[name]()
 
 
-def _stepped(problem: ChargingProblem, name: str, law: Law, limits: Sequence[object]) -> Row:
-    stepped = triable(problem.plant)
+def _stepped(problem: ChargingProblem, name: str, law: CurrentLaw, limits: Sequence[object]) -> Row:
+    stepped = as_steppable(problem.plant)
     if stepped is None:
         raise ValueError(f"{name}: the next interval of this plant cannot be tried")
     episode = charge(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.certification.clopper_pearson import violation_bound
-from chargetune.battery.certification.variations import MEANING, Draw, Spread, Variations
+from chargetune.battery.certification.variations import MEANING, Draw, PlantVariation, Variations
 from chargetune.battery.charging.metrics import SOC_MARKS
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.episode import Episode
@@ -52,7 +52,7 @@ def run_charges(
     problem: ChargingProblem,
     theta: Sequence[float],
     *,
-    spread: Spread,
+    spread: PlantVariation,
     seed: int,
     episodes: int,
     executor: Executor | None = None,
@@ -110,7 +110,7 @@ def write_certificate(
     *,
     theta: Mapping[str, float],
     origin: Mapping[str, Any],
-    spread: Spread,
+    spread: PlantVariation,
     seed: int,
     confidence: float,
 ) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def _traces_of(path: Path) -> Path | None:
     return path.with_name(name) if own else None
 
 
-def _portion(problem: ChargingProblem, theta: tuple[float, ...], spread: Spread, seed: int, part: Sequence[int]) -> list[Charge]:
+def _portion(problem: ChargingProblem, theta: tuple[float, ...], spread: PlantVariation, seed: int, part: Sequence[int]) -> list[Charge]:
     variations = Variations(problem)
     out = []
     for index in part:

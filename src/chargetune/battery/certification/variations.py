@@ -22,7 +22,7 @@ from chargetune.model.model import Model
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["MEANING", "Draw", "Spread", "Variations"]
+__all__ = ["MEANING", "Draw", "PlantVariation", "Variations"]
 
 MEANING = (
     "The plant differs from the tuned one, the controller does not know it. Each draw is uniform: "
@@ -44,7 +44,7 @@ class Draw:
 
 
 @dataclass(frozen=True)
-class Spread:
+class PlantVariation:
     """Half widths of what is drawn uniformly, relative except for the SOC; ``fade`` and ``growth`` at full age.
 
     The defaults are the scatter of new cells of one make and the first few hundred cycles. See `MEANING`.

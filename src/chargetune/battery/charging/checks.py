@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model
 from chargetune.battery.charging.problem import ChargingProblem, stand_in
-from chargetune.battery.plants.steppable import triable
+from chargetune.battery.plants.steppable import as_steppable
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_theta
 from chargetune.checks.nominal_loop import check_formulation
@@ -145,7 +145,7 @@ def _plant_signs(problem: ChargingProblem) -> list[Finding]:
     if problem.plant_model is None:
         return []
     plant = problem.plant
-    if triable(plant) is None:
+    if as_steppable(plant) is None:
         return []
     run: Episode = run_episode(problem.controller, plant, steps=PROBE_STEPS)
     return check_response(problem.controller, run)

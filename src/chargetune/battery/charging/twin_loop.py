@@ -15,15 +15,15 @@ from chargetune.battery.charging.problem import ChargingProblem, NotMeasuredErro
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.score import Score
 from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
-    from chargetune.learning.twin.discrepancy import OutputError
+    from chargetune.learning.twin.discrepancy import DiscrepancySample
     from chargetune.learning.twin.twin import Twin
-    from chargetune.learning.twin.twin_loop import Case
+    from chargetune.learning.twin.twin_loop import Member
 
 __all__ = ["ChargingTwin"]
 
@@ -101,21 +101,21 @@ class ChargingTwin:
     def row_tolerances(self) -> NDArray[np.float64]:
         return self.problem.row_tolerances
 
-    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+    def simulate(self, cases: Sequence[Member]) -> list[Episode | None]:
         """Charges without noise, with the third of each case added to what is measured and so to what the estimator reads."""
         thetas, plants = [theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases]
         episodes = self._loop.run_each(thetas, plants, tables=[self._table(unknowns, error) for _, unknowns, error in cases])
         return [episode if episode.ending is Ending.DONE else None for episode in episodes]
 
-    def _table(self, unknowns: NDArray[np.float64], error: OutputError | None) -> NDArray[np.float64]:
-        """The error and the constants of the unknowns, both of what is measured, on `_lattice`."""
+    def _table(self, unknowns: NDArray[np.float64], error: DiscrepancySample | None) -> NDArray[np.float64]:
+        """The error and the constants of the unknowns, both of what is measured, on `_lookup_table`."""
         biases = self.twin.biases(unknowns)
-        constants = np.array([biases.get(name, 0.0) for name in self._lattice.outputs])[:, None]
-        return np.tile(constants, self._lattice.size) if error is None else error.table + constants
+        constants = np.array([biases.get(name, 0.0) for name in self._lookup_table.outputs])[:, None]
+        return np.tile(constants, self._lookup_table.size) if error is None else error.table + constants
 
     @cached_property
-    def _lattice(self) -> Lattice:
-        return Lattice.over(self.features, list(self.twin.noise_sd))
+    def _lookup_table(self) -> LookupTable:
+        return LookupTable.over(self.features, list(self.twin.noise_sd))
 
     def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
         # An ensemble goes through many thetas: its plants are made once.
@@ -166,4 +166,6 @@ class ChargingTwin:
         plant = problem.plant
         if not isinstance(plant, SimulatedPlant):
             raise TypeError("the twin's plant is a simulated circuit")
-        return compiled_episode(self.problem.controller, replace(plant, model=self._circuit), problem.steps, lattice=self._lattice)
+        return compiled_episode(
+            self.problem.controller, replace(plant, model=self._circuit), problem.steps, lookup_table=self._lookup_table
+        )

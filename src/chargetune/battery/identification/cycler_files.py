@@ -1,4 +1,4 @@
-"""Reading what battery cyclers write: one CSV table of time, current, voltage and, where there is one, temperature.
+"""ReadStudy what battery cyclers write: one CSV table of time, current, voltage and, where there is one, temperature.
 
 Columns are found by name, as Bitrode, Arbin, Neware, BioLogic and the Battery Data Format (BDF) write them:
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from chargetune.battery.identification.record import Record
-from chargetune.battery.plants.steppable import Stepped
+from chargetune.battery.plants.steppable import SteppablePlant
 from chargetune.plants.plant import PlantError
 
 __all__ = ["pulse_test", "record_csv", "slow_cycle"]
@@ -18,7 +18,7 @@ REST_S = 3600.0
 
 
 def pulse_test(
-    sampled: Callable[[float], Stepped],
+    sampled: Callable[[float], SteppablePlant],
     *,
     capacity_Ah: float,
     voltage_min_V: float,
@@ -38,7 +38,7 @@ def pulse_test(
     one, state, now = rate * capacity_Ah, fast.start, 0.0
     rows: list[tuple[float, float, float, float]] = []
 
-    def apply(plant: Stepped, current: float, seconds: float, *, until_V: float | None = None) -> bool:
+    def apply(plant: SteppablePlant, current: float, seconds: float, *, until_V: float | None = None) -> bool:
         """Whether the voltage stayed above ``until_V`` throughout."""
         nonlocal state, now
         for _ in range(round(seconds / plant.sampling_time_s)):
@@ -68,7 +68,7 @@ def pulse_test(
 
 
 def slow_cycle(
-    plant: Stepped, *, capacity_Ah: float, voltage_min_V: float, voltage_max_V: float, rate: float = 0.04, last: float = 0.1
+    plant: SteppablePlant, *, capacity_Ah: float, voltage_min_V: float, voltage_max_V: float, rate: float = 0.04, last: float = 0.1
 ) -> Record:
     """One discharge of a full cell at ``rate`` (1/h) to ``voltage_min_V`` and the charge back to ``voltage_max_V``.
 

@@ -13,10 +13,10 @@ from chargetune.model.model import Signal
 from chargetune.plants.plant import Plant
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["Stepped", "triable"]
+__all__ = ["SteppablePlant", "as_steppable"]
 
 
-class Stepped(Protocol):
+class SteppablePlant(Protocol):
     """A plant whose next interval can be tried with any current from any state it was in."""
 
     @property
@@ -61,7 +61,7 @@ class _Circuit:
         return first, last, following
 
 
-def triable(plant: Plant) -> Stepped | None:
+def as_steppable(plant: Plant) -> SteppablePlant | None:
     """The plant as one whose next interval can be tried; None when it cannot (an instrument)."""
     if isinstance(plant, SimulatedPlant):
         return _Circuit(plant)

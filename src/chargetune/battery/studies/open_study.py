@@ -57,7 +57,7 @@ def make_tuner(
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
         "sobol": lambda s: learning.Sobol(seed=s),
         "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
-        "envelope": lambda _: learning.Envelope(twin),
+        "iterative_learning": lambda _: learning.IterativeLearning(twin),
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)

@@ -27,7 +27,7 @@ __all__ = ["Config", "TunerName", "load_config", "problem_of_document", "read_ta
 
 
 T = TypeVar("T", bound=BaseModel)
-TunerName = Literal["default", "ei", "sobol", "twin", "envelope", "composite"]
+TunerName = Literal["default", "ei", "sobol", "twin", "iterative_learning", "composite"]
 RESISTANCES: tuple[Literal["R0", "R1", "R2", "R3"], ...] = ("R0", "R1", "R2", "R3")
 
 

@@ -147,14 +147,14 @@ class Composite:
         return np.vstack([centre, corner + DESIGN * points])
 
     def _proposal(self, data: _Data, count: int, failed: list[NDArray[np.float64]], seed: int) -> NDArray[np.float64]:
-        belief = _Belief(data)
+        ensemble = _Belief(data)
         cautious = (count - self.n_initial) % 2 == 1
-        merit = _Merit(belief, CAUTION if cautious else -OPTIMISM, 0.0 if cautious else OPTIMISM)
+        merit = _Merit(ensemble, CAUTION if cautious else -OPTIMISM, 0.0 if cautious else OPTIMISM)
         d = data.x.shape[1]
-        points = torch.cat([candidates(d, seed, belief.x[belief.incumbent]), belief.x])
+        points = torch.cat([candidates(d, seed, ensemble.x[ensemble.incumbent]), ensemble.x])
         away = AwayFromFailures(merit, torch.as_tensor(np.array(failed).reshape(-1, d)))
         # The newest trials are the two sides of what is sought: one kept the limits, the other was quicker.
-        return maximise(away, points, data.x, starts=STARTS, also=belief.x[-STARTS:], iterations=ITERATIONS).numpy()
+        return maximise(away, points, data.x, starts=STARTS, also=ensemble.x[-STARTS:], iterations=ITERATIONS).numpy()
 
 
 @dataclass(frozen=True)
@@ -190,12 +190,12 @@ class _Data:
         """With what is expected at u told as if it were measured."""
         if not len(self.x):
             return self
-        belief = _Belief(self)
+        ensemble = _Belief(self)
         with torch.no_grad():
-            rate, _ = belief.rates(torch.as_tensor(u)[None])
-            excess, _ = belief.excesses(torch.as_tensor(u)[None])
+            rate, _ = ensemble.rates(torch.as_tensor(u)[None])
+            excess, _ = ensemble.excesses(torch.as_tensor(u)[None])
         filled = np.full(self.excess.shape[1], np.nan)
-        filled[belief.near] = excess[0].numpy()
+        filled[ensemble.near] = excess[0].numpy()
         return _Data(
             self.loop,
             np.vstack([self.x, u]),
@@ -298,9 +298,9 @@ def _near(excess: NDArray[np.float64]) -> NDArray[np.bool_]:
 class _Merit(AcquisitionFunction):
     """`_Belief.merit` as BoTorch asks for it."""
 
-    def __init__(self, belief: _Belief, caution: float, optimism: float) -> None:
-        super().__init__(model=belief.rates.model)
-        self._belief, self._caution, self._optimism = belief, caution, optimism
+    def __init__(self, ensemble: _Belief, caution: float, optimism: float) -> None:
+        super().__init__(model=ensemble.rates.model)
+        self._belief, self._caution, self._optimism = ensemble, caution, optimism
 
     @t_batch_mode_transform(expected_q=1, assert_output_shape=False)  # type: ignore[arg-type] # it types self as the base class
     def forward(self, X: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ __all__ = ["FAILURES", "GaussianProcess", "SurrogateWarning", "fitted", "posteri
 # Nothing here needs more iterations: later ones change the hyperparameters in their third digit.
 FIT_ITERATIONS = 30
 NOISE_LEAST = 1e-6
-# What a matrix that is singular to rounding, or a flat function, ends with; anything else is a mistake in the program.
+# What a matrix that is singular to rounding, or a flat function, ends with; anything else is a standardised_error in the program.
 FAILURES = (ModelFittingError, OptimizationGradientError, NanError, NotPSDError, LinAlgError)
 
 

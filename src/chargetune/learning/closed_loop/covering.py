@@ -14,8 +14,8 @@ from scipy.sparse import csr_matrix, hstack, identity
 from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 from chargetune.runtime.cache import cached
-from chargetune.runtime.hoisting import parametric
-from chargetune.runtime.numpy_call import evaluated
+from chargetune.runtime.hoisting import hoist
+from chargetune.runtime.numpy_call import numpy_call
 
 __all__ = ["covering", "predicted_rows"]
 
@@ -63,9 +63,9 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
     d, count = len(theta), len(episode)
     roll = cached(f"rolled rows {controller.structure} {count}", lambda: step.mapaccum("rolled", count, 2))
-    (q,) = evaluated(of_fixed, theta, controller.model.nominal)
+    (q,) = numpy_call(of_fixed, theta, controller.model.nominal)
     given = (memory, np.zeros((d, memory.size)), received, last, episode.input, np.tile(q, (count, 1)))
-    _, _, rows, slopes = evaluated(roll, *given)
+    _, _, rows, slopes = numpy_call(roll, *given)
     return rows.reshape(count, 2, -1), slopes.reshape(count, d, 2, -1).transpose(0, 2, 3, 1)
 
 
@@ -207,5 +207,5 @@ def _step(controller: Controller) -> _Rolled:
         return ca.densify(own if known else own + ca.mtimes(ca.jacobian(value, memory), slopes))
 
     rise = ca.vec(total(every))
-    step, of_fixed = parametric("rows", [memory, slopes, received, last, u], [theta, nominal], [ahead, total(ahead), every, rise])
+    step, of_fixed = hoist("rows", [memory, slopes, received, last, u], [theta, nominal], [ahead, total(ahead), every, rise])
     return _Rolled(step, of_fixed, known and not ca.depends_on(rise, theta))

@@ -14,15 +14,15 @@ from chargetune.learning.closed_loop.covering import (
     covering,
     predicted_rows,
 )
-from chargetune.learning.closed_loop.loop import EnvelopeLoop
+from chargetune.learning.closed_loop.loop import ClosedLoop
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["Envelope"]
+__all__ = ["IterativeLearning"]
 
 
 @dataclass(frozen=True)
-class Envelope:
+class IterativeLearning:
     """Iterative learning: the theta whose predictions cover what was measured last, filtered and damped. No model of the plant.
 
     Per sample the error of the controller's prediction, e_k - c_k at the newest trace, is smoothed (Savitzky-Golay, order 2) and
@@ -30,7 +30,7 @@ class Envelope:
     Quick, and without a promise: it does not know what it has not seen. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
     """
 
-    loop: EnvelopeLoop
+    loop: ClosedLoop
     relax: float = 0.7
     window: int = 21
     start: tuple[float, ...] | None = None

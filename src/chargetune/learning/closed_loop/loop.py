@@ -12,7 +12,7 @@ from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score, in_tolerances
 
-__all__ = ["EnvelopeLoop", "Simulate", "samples_of", "windows_of"]
+__all__ = ["ClosedLoop", "Simulate", "samples_of", "windows_of"]
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
 """thetas -> the episode of each on one simulated plant, None where it fails."""
@@ -45,7 +45,7 @@ def samples_of(
     return np.concatenate(values), np.concatenate(windows)
 
 
-class EnvelopeLoop(Protocol):
+class ClosedLoop(Protocol):
     """A controller, and the measured counterpart of the limits that it predicts."""
 
     @property

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from chargetune.learning.closed_loop.search import Search
-from chargetune.learning.closed_loop.slp import Lines, Point, corner
+from chargetune.learning.closed_loop.slp import Linearisation, Point, solve_slp
 from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["nearest"]
@@ -46,7 +46,7 @@ def nearest(
     """The theta nearest to ``best``, the best trial's, that promises an objective of ``promised``, as ``start`` about does.
 
     min |u - u_best|^2 in the unit cube  s.t.  objective >= promised, less the share `GAIN` of its size, and
-    excess <= allowed at every sample, by its window, in tolerances beyond the tolerance (`windows_of`), by least distances (`corner`).
+    excess <= allowed at every sample, by its window, in tolerances beyond the tolerance (`windows_of`), by least distances (`solve_slp`).
 
     A change is a step into what has not been seen: entries that what is aimed at does not need stay where they were tried.
     ``search`` simulates the expected plant, so that ``allowed`` is to hold the margins. Where no point is found it is ``start``.
@@ -75,11 +75,11 @@ def nearest(
         search.scores(us)
         return [point(u) for u in us]
 
-    programme = _LeastDistance(to, whole)
+    subproblem = _LeastDistance(to, whole)
     if np.linalg.norm(first - to) > ARRIVED:
-        corner(points, to, ITERATIONS_NEAR, NEARER, ROUNDING, programme)
+        solve_slp(points, to, ITERATIONS_NEAR, NEARER, ROUNDING, subproblem)
     if not seen:
-        corner(points, first, ITERATIONS, NEARER, ROUNDING, programme)
+        solve_slp(points, first, ITERATIONS, NEARER, ROUNDING, subproblem)
     found = min(seen, key=lambda key: seen[key], default=None)
     return start if found is None else space.from_unit(np.frombuffer(found))
 
@@ -97,7 +97,9 @@ class _LeastDistance:
     price: ClassVar[float] = PRICE
     least: ClassVar[float] = 1.0
 
-    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+    def step(
+        self, lines: Linearisation, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0
+    ) -> tuple[NDArray[np.float64], float]:
         """min |u + d - to|^2 + rho t + (rho t / 2 PULL)^2  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
 
         With s = rho t / (2 PULL) it is the least distance of (d, s) to (to - u, -PULL).
@@ -123,6 +125,6 @@ class _LeastDistance:
         step = np.clip(self.whole * (aim - residual[:-1] / residual[-1])[:size], low, high)
         return step, float(np.max(rows + jacobian @ step, initial=0.0))
 
-    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+    def falls(self, lines: Linearisation, step: NDArray[np.float64]) -> float:
         before, after = lines.u - self.to, lines.u + step - self.to
         return float(before @ before - after @ after) / self.whole**2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.covering import covering
 from chargetune.learning.closed_loop.loop import Simulate, samples_of, windows_of
-from chargetune.learning.closed_loop.slp import Point, corner
+from chargetune.learning.closed_loop.slp import Point, solve_slp
 from chargetune.learning.twin.twin_loop import TwinLoop
 from chargetune.model.parameter_space import ParameterSpace
 
@@ -80,12 +80,12 @@ class Search:
             self.score(self._space.to_unit(theta))
 
     def refine(self, start: NDArray[np.float64], iterations: int, gain: float = LEAST) -> None:
-        """From ``start`` to the best point near it (`corner`); every point it visits is remembered.
+        """From ``start`` to the best point near it (`solve_slp`); every point it visits is remembered.
 
         Its rows are the samples, not the windows of the verdict: the largest of many that all ride their limit has a kink wherever
         another one becomes it, and what is linear about a kink leads nowhere.
         """
-        corner(self._points, start, iterations, gain, ROUNDING)
+        solve_slp(self._points, start, iterations, gain, ROUNDING)
 
     def _points(self, points: Sequence[NDArray[np.float64]]) -> list[Point | None]:
         self.scores(points)
@@ -96,7 +96,7 @@ class Search:
         return Point(-seen.score.objective, excess + (self._margin if np.ndim(self._margin) == 0 else np.asarray(self._margin)[window]))
 
     def merit(self, u: NDArray[np.float64]) -> float:
-        """The objective, to be minimised, and the worst violation at its price in `corner`."""
+        """The objective, to be minimised, and the worst violation at its price in `solve_slp`."""
         seen = self._at(u)
         return np.inf if seen is None else abs(seen.score.objective) * max(0.0, self._worst(seen)) - seen.score.objective
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-__all__ = ["Evaluate", "Lines", "Point", "Programme", "corner"]
+__all__ = ["Evaluate", "Linearisation", "Point", "Subproblem", "solve_slp"]
 
 # Step of the finite differences.
 STEP = 2e-3
@@ -41,7 +41,7 @@ Evaluate = Callable[[Sequence[NDArray[np.float64]]], Sequence[Point | None]]
 
 
 @dataclass(frozen=True)
-class Lines:
+class Linearisation:
     """Objective and rows around a point u, by their slopes there."""
 
     u: NDArray[np.float64]
@@ -60,7 +60,7 @@ class Lines:
         return rows[near], self.jacobian[near]
 
 
-class Programme(Protocol):
+class Subproblem(Protocol):
     """What a step is taken by."""
 
     @property
@@ -78,11 +78,13 @@ class Programme(Protocol):
         """What the objective cannot be below."""
         ...
 
-    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
-        """The best step and the violation it leaves; ``bent`` as in `Lines.near`."""
+    def step(
+        self, lines: Linearisation, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0
+    ) -> tuple[NDArray[np.float64], float]:
+        """The best step and the violation it leaves; ``bent`` as in `Linearisation.near`."""
         ...
 
-    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+    def falls(self, lines: Linearisation, step: NDArray[np.float64]) -> float:
         """By how much a step lowers the objective."""
         ...
 
@@ -92,7 +94,9 @@ class _Linear:
     price: ClassVar[float] = 1.0
     least: ClassVar[float] = -np.inf
 
-    def step(self, lines: Lines, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[np.float64], float]:
+    def step(
+        self, lines: Linearisation, radius: float, price: float, bent: NDArray[np.float64] | float = 0.0
+    ) -> tuple[NDArray[np.float64], float]:
         d = lines.u.size
         rows, jacobian = lines.near(radius, bent)
         matrix = np.hstack([jacobian, -np.ones((rows.size, 1))])
@@ -107,23 +111,23 @@ class _Linear:
         warnings.warn(f"a linear program of {rows.size} rows failed, no step ({message})", RuntimeWarning, stacklevel=2)
         return np.zeros(d), float(np.max(lines.rows + bent, initial=0.0))
 
-    def falls(self, lines: Lines, step: NDArray[np.float64]) -> float:
+    def falls(self, lines: Linearisation, step: NDArray[np.float64]) -> float:
         return -float(lines.gradient @ step)
 
 
-def corner(
+def solve_slp(
     evaluate: Evaluate,
     start: NDArray[np.float64],
     iterations: int,
     gain: float,
     kept: float = 0.0,
-    programme: Programme | None = None,
+    subproblem: Subproblem | None = None,
 ) -> NDArray[np.float64]:
     """The best point of the unit cube that keeps all rows, from ``start``, which need not.
 
         min f(u)  s.t.  c(u) <= 0,  0 <= u <= 1
 
-    by linear programs (HiGHS; or another ``programme``) with finite differences g, J, within a trust region,
+    by linear programs (HiGHS; or another ``subproblem``) with finite differences g, J, within a trust region,
 
         min g'd + rho t  s.t.  c + J d <= t,  t >= 0,  |d| <= radius,  0 <= u + d <= 1.
 
@@ -138,16 +142,16 @@ def corner(
     (here,) = evaluate([start])
     if here is None:
         return start
-    programme = programme or _Linear()
-    u, radius, price = start, programme.radius, programme.price * (abs(here.objective) or 1.0)
+    subproblem = subproblem or _Linear()
+    u, radius, price = start, subproblem.radius, subproblem.price * (abs(here.objective) or 1.0)
     longest, dearest = max(radius, LONGEST), price * DEARER**TIMES
     for _ in range(iterations):
-        if here.violation <= kept and here.objective - programme.least < gain * abs(here.objective):
+        if here.violation <= kept and here.objective - subproblem.least < gain * abs(here.objective):
             return u
         lines = _linearised(evaluate, u, here)
         while True:
-            step, left = programme.step(lines, radius, price)
-            promised = price * (here.violation - left) + programme.falls(lines, step)
+            step, left = subproblem.step(lines, radius, price)
+            promised = price * (here.violation - left) + subproblem.falls(lines, step)
             mended = price * (here.violation - left) if here.violation <= kept else 0.0
             if radius < SHORTEST:
                 return u
@@ -160,7 +164,7 @@ def corner(
             for _ in range(CORRECTIONS):
                 if there is None or held >= HOLDS * promised:
                     break
-                step, _ = programme.step(lines, radius, price, _rise(here.rows, there.rows) - lines.jacobian @ step)
+                step, _ = subproblem.step(lines, radius, price, _rise(here.rows, there.rows) - lines.jacobian @ step)
                 there, held = _held(evaluate, u, here, step, price)
             if there is not None and held >= HOLDS * promised:
                 break
@@ -182,14 +186,14 @@ def _held(evaluate: Evaluate, u: NDArray[np.float64], here: Point, step: NDArray
     return there, here.objective - there.objective + price * (here.violation - there.violation)
 
 
-def _linearised(evaluate: Evaluate, u: NDArray[np.float64], here: Point) -> Lines:
+def _linearised(evaluate: Evaluate, u: NDArray[np.float64], here: Point) -> Linearisation:
     steps = np.where(u + STEP <= 1.0, STEP, -STEP)
     gradient, jacobian = np.zeros(u.size), np.zeros((here.rows.size, u.size))
     for i, (step, ahead) in enumerate(zip(steps, evaluate([u + one for one in np.diag(steps)]), strict=True)):
         if ahead is not None and ahead.rows.shape == here.rows.shape:
             gradient[i] = (ahead.objective - here.objective) / step
             jacobian[:, i] = _rise(here.rows, ahead.rows) / step
-    return Lines(u, here.rows, gradient, jacobian)
+    return Linearisation(u, here.rows, gradient, jacobian)
 
 
 def _rise(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky
 
 from chargetune.episode.episode import Episode
-from chargetune.episode.lookup_table import Lattice
+from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning.black_box.gaussian_process import fitted
 from chargetune.learning.black_box.optimize_acquisition import reproducible
-from chargetune.learning.twin.calibration import SCALES, Foretold
+from chargetune.learning.twin.calibration import SCALES, PredictionCheck
 from chargetune.learning.twin.posterior import Posterior
-from chargetune.learning.twin.residuals import TOGETHER, blocks
-from chargetune.runtime.threads import each
+from chargetune.learning.twin.residuals import CORRELATED_BINS, binned_residuals
+from chargetune.runtime.threads import parallel_map
 
-__all__ = ["Discrepancy", "OutputError"]
+__all__ = ["Discrepancy", "DiscrepancySample"]
 
 # Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
 LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
@@ -39,7 +39,7 @@ class Discrepancy:
     """b_i(s) ~ GP(0, a_i^2 k(s, s')), k Matern 3/2: y_i = h_i(x, u, p) + b_i(s) + noise for each measured output i.
 
     s are ``features`` of an episode, signals with the range by which they are scaled: for a charge the SOC, the current and,
-    where it is measured, the temperature. The data are residuals, averaged over `BLOCKS` stretches of each episode, because
+    where it is measured, the temperature. The data are residuals, averaged over `BINS` stretches of each episode, because
     neighbouring residuals have the same cause. The error of an output that is a state does not depend on the inputs among the features:
     it has the inertia of the state. For a draw of the twin's unknowns the process is conditioned on that draw's own
     residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
@@ -60,14 +60,14 @@ class Discrepancy:
             raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {len(LENGTH)}")
 
     def scaled(self, scale: float) -> Discrepancy:
-        """The same with another factor on the floor ``Twin.error_sd``, not on what the residuals ask for, nor on the hyperparameters."""
+        """The same with another factor on the floor ``Twin.discrepancy_sd_floor``, not on what the residuals ask for, nor on the hyperparameters."""
         return replace(self, scale=scale, like=self)
 
-    def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> OutputError:
+    def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> DiscrepancySample:
         """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
         return self._error(self._residuals(unknowns), seed)
 
-    def _error(self, left: NDArray[np.float64], seed: int | None) -> OutputError:
+    def _error(self, left: NDArray[np.float64], seed: int | None) -> DiscrepancySample:
         stream = None if seed is None else np.random.default_rng(seed)
         tables = []
         for i, part in enumerate(self._parts):
@@ -75,29 +75,29 @@ class Discrepancy:
             if stream is not None:
                 table = table + part.root @ stream.standard_normal(len(table))
             tables.append(table)
-        return OutputError(self, np.stack(tables))
+        return DiscrepancySample(self, np.stack(tables))
 
-    def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[OutputError]:
+    def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[DiscrepancySample]:
         """A sample of `error` for each of several plants, unknowns of shape (plants, d)."""
-        each(lambda part: part.root, self._parts)
-        return each(self._error, self._residuals(unknowns), seeds)
+        parallel_map(lambda part: part.root, self._parts)
+        return parallel_map(self._error, self._residuals(unknowns), seeds)
 
-    def foretold(self, episode: Episode) -> Foretold:
+    def predicted_before(self, episode: Episode) -> PredictionCheck:
         """How well an episode that was not learnt from was predicted, at its recorded inputs.
 
         Each stretch of the episode differs by r ~ N(0, d_s^2 + v) from its prediction: d_s the standard deviation of the discrepancy with
-        the scale s (`scaled`), v from noise and unknowns. Neighbouring stretches err together, so `TOGETHER` of them count as one; and
+        the scale s (`scaled`), v from noise and unknowns. Neighbouring stretches err together, so `CORRELATED_BINS` of them count as one; and
         each counts by the share of its prior variance that d_1^2 still is: what was measured before comes out as it was, however wrong
         the process is elsewhere.
         """
         off = self._off(episode)
         known = off.known
         if not known.any():
-            return Foretold(np.zeros_like(SCALES), 0.0)
+            return PredictionCheck(np.zeros_like(SCALES), 0.0)
         variance = off.unmodelled[:, known] + off.rest[known]
-        chance = -0.5 * np.sum(off.novel[known] * (np.log(variance) + off.square[known] / variance), axis=1) / TOGETHER
-        stated = np.array([self.posterior.twin.error_sd.get(name, 0.0) for name in self.posterior.twin.noise_sd])
-        return Foretold(chance, float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))))
+        chance = -0.5 * np.sum(off.novel[known] * (np.log(variance) + off.square[known] / variance), axis=1) / CORRELATED_BINS
+        stated = np.array([self.posterior.twin.discrepancy_sd_floor.get(name, 0.0) for name in self.posterior.twin.noise_sd])
+        return PredictionCheck(chance, float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))))
 
     def _off(self, episode: Episode) -> _Off:
         posterior, twin = self.posterior, self.posterior.twin
@@ -106,10 +106,10 @@ class Discrepancy:
         filled = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
         filled.output_start[:, columns], filled.output_end[:, columns] = predicted[:, 0], predicted[:, 1]
         filled = self.error(posterior.mode)(filled)
-        left, counts = blocks(twin.measured(episode) - twin.measured(filled))
+        left, counts = binned_residuals(twin.measured(episode) - twin.measured(filled))
         noise = np.array(list(twin.noise_sd.values()))
-        own = blocks(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        weights = self.lattice.weights(self._at(episode))
+        own = binned_residuals(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
+        weights = self.lookup_table.weights(self._at(episode))
         left_over = np.stack([part.variance(weights) for part in self._parts], axis=1)
         before = np.stack([part.variance_before(weights) for part in self._parts], axis=1)
         rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
@@ -134,13 +134,13 @@ class Discrepancy:
         return out
 
     @cached_property
-    def lattice(self) -> Lattice:
+    def lookup_table(self) -> LookupTable:
         """The nodes at which a sample is drawn together."""
-        return Lattice.over(self.features, list(self.posterior.twin.noise_sd))
+        return LookupTable.over(self.features, list(self.posterior.twin.noise_sd))
 
     def _at(self, episode: Episode) -> NDArray[np.float64]:
         """Mean features of every stretch, shape (stretches, features)."""
-        return blocks(self.signals(episode))[0]
+        return binned_residuals(self.signals(episode))[0]
 
     def signals(self, episode: Episode) -> NDArray[np.float64]:
         """Features at both ends of every interval, shape (intervals, 2, features).
@@ -169,7 +169,7 @@ class Discrepancy:
         out = []
         for episode, values in zip(self.episodes, predicted, strict=True):
             measured = twin.measured(episode)
-            means = [blocks(measured - own)[0] for own in values.reshape(-1, *measured.shape)]
+            means = [binned_residuals(measured - own)[0] for own in values.reshape(-1, *measured.shape)]
             out.append(np.stack(means).reshape(*several, *means[0].shape))
         return np.nan_to_num(np.concatenate(out, axis=len(several)), nan=0.0)
 
@@ -178,10 +178,10 @@ class Discrepancy:
         if self.like:
             return self.like.data
         twin = self.posterior.twin
-        counts = np.concatenate([blocks(twin.measured(e))[1] for e in self.episodes])
+        counts = np.concatenate([binned_residuals(twin.measured(e))[1] for e in self.episodes])
         at = np.concatenate([self._at(episode) for episode in self.episodes])
         noise = np.array(list(twin.noise_sd.values()))
-        return _Data(self.lattice.unit(at), self.lattice.weights(at), noise**2 / np.maximum(counts, 1e-9))
+        return _Data(self.lookup_table.unit(at), self.lookup_table.weights(at), noise**2 / np.maximum(counts, 1e-9))
 
     @cached_property
     def _inputs(self) -> NDArray[np.bool_]:
@@ -198,16 +198,18 @@ class Discrepancy:
             return self.like.fitted
         left, data = self._residuals(self.posterior.mode), self.data
         on = np.array([np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd])[:, None]
-        return _fit(data.at * on, left.T, data.variance.T, self.lattice.nodes * on)
+        return _fit(data.at * on, left.T, data.variance.T, self.lookup_table.nodes * on)
 
     @cached_property
     def _floors(self) -> tuple[NDArray[np.float64], ...]:
         """By output, how far off it may be at each node however well the model fits elsewhere; without the scale."""
-        twin, nodes, inputs = self.posterior.twin, self.lattice.nodes, self._inputs
+        twin, nodes, inputs = self.posterior.twin, self.lookup_table.nodes, self._inputs
         low, high = np.array(list(self.features.values())).T
-        sizes = np.abs(self.lattice.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
-        flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.error_at_rest) ** 0.5 if inputs.any() else np.ones(len(nodes))
-        return tuple(twin.error_sd.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing) for name in twin.noise_sd)
+        sizes = np.abs(self.lookup_table.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
+        flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.floor_at_zero_input) ** 0.5 if inputs.any() else np.ones(len(nodes))
+        return tuple(
+            twin.discrepancy_sd_floor.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing) for name in twin.noise_sd
+        )
 
     @cached_property
     def _parts(self) -> tuple[_Part, ...]:
@@ -220,21 +222,21 @@ class Discrepancy:
 
 
 @dataclass(frozen=True)
-class OutputError:
-    """What the twin cannot represent of one plant: ``table`` has the shape (outputs, nodes), on ``discrepancy.lattice``."""
+class DiscrepancySample:
+    """What the twin cannot represent of one plant: ``table`` has the shape (outputs, nodes), on ``discrepancy.lookup_table``."""
 
     discrepancy: Discrepancy
     table: NDArray[np.float64]
 
     def __call__(self, episode: Episode) -> Episode:
         """A predicted episode -> the same with this added to its outputs."""
-        lattice = self.discrepancy.lattice
-        columns = [episode.output_names.index(name) for name in lattice.outputs]
+        lookup_table = self.discrepancy.lookup_table
+        columns = [episode.output_names.index(name) for name in lookup_table.outputs]
         at = self.discrepancy.signals(episode)
         changed = []
         for k, outputs in enumerate((episode.output_start, episode.output_end)):
             out = outputs.copy()
-            nodes, shares = lattice.around(at[:, k])
+            nodes, shares = lookup_table.around(at[:, k])
             out[:, columns] += np.sum(self.table[:, nodes] * shares, axis=-1).T
             changed.append(out)
         return replace(episode, output_start=changed[0], output_end=changed[1])

@@ -15,13 +15,13 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import Simulate, windows_of
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin.calibration import SCALES, scale_of
-from chargetune.learning.twin.discrepancy import Discrepancy, OutputError
+from chargetune.learning.twin.calibration import SCALES, calibrate_scale
+from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
 from chargetune.learning.twin.posterior import Posterior
 from chargetune.learning.twin.twin_loop import TwinLoop
-from chargetune.runtime.threads import meanwhile
+from chargetune.runtime.threads import submit
 
-__all__ = ["Belief", "Prediction", "believe", "episodes_of"]
+__all__ = ["Ensemble", "Prediction", "condition", "episodes_of"]
 
 # Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
 TRACES_MAX = 4
@@ -30,31 +30,31 @@ MISTAKEN = 3.5
 
 
 @dataclass(frozen=True)
-class Belief:
+class Ensemble:
     """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
 
-    ``mistake``: how wrong those before it were about the newest trial (`Discrepancy.foretold`); 0 before two are known.
+    ``standardised_error``: how wrong those before it were about the newest trial (`Discrepancy.predicted_before`); 0 before two are known.
     """
 
     loop: TwinLoop
     posterior: Posterior
     discrepancy: Discrepancy | None
-    mistake: float = 0.0
+    standardised_error: float = 0.0
 
     @property
-    def foretold(self) -> int:
-        """How many of the traces learnt from were foretold by those before them."""
+    def predicted_before(self) -> int:
+        """How many of the traces learnt from were predicted_before by those before them."""
         return len(self.discrepancy.episodes) - 1 if self.discrepancy else 0
 
     @property
     def proved(self) -> bool:
-        """Whether there is a trial that those before it foretold."""
-        return self.foretold > 0
+        """Whether there is a trial that those before it predicted_before."""
+        return self.predicted_before > 0
 
     @property
     def mistaken(self) -> bool:
-        """Whether the newest trial was so far from what two or more before it foretold that the twin is none."""
-        return self.foretold > 1 and self.mistake >= MISTAKEN
+        """Whether the newest trial was so far from what two or more before it predicted_before that the twin is none."""
+        return self.predicted_before > 1 and self.standardised_error >= MISTAKEN
 
     @property
     def beyond_scale(self) -> bool:
@@ -79,12 +79,12 @@ class Belief:
         return [self._scored[theta.tobytes()] for theta in thetas]
 
     def plant(self, seed: int) -> Simulate:
-        """One plant drawn from the belief: thetas -> episodes."""
+        """One plant drawn from the ensemble: thetas -> episodes."""
         ((m, error),) = self._plants(1, seed)
         return lambda thetas: self.loop.simulate([(theta, m, error) for theta in thetas])
 
     def predict(self, theta: NDArray[np.float64], count: int, seed: int) -> Prediction:
-        """What ``count`` plants drawn from the belief do; the same plants for the same seed."""
+        """What ``count`` plants drawn from the ensemble do; the same plants for the same seed."""
         return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in self._plants(count, seed)])))
 
     def replayed(self, episode: Episode, count: int, seed: int) -> Prediction:
@@ -104,16 +104,16 @@ class Belief:
         return Prediction(self.loop, tuple(out))
 
     @cached_property
-    def _centre(self) -> tuple[NDArray[np.float64], OutputError | None]:
+    def _centre(self) -> tuple[NDArray[np.float64], DiscrepancySample | None]:
         mode = self.posterior.mode
         return mode, self.discrepancy.error(mode) if self.discrepancy else None
 
     def draw(self, count: int, seed: int) -> None:
         """Begins to draw the plants of `predict` with this count and seed, while something else goes on."""
         if (count, seed) not in self._drawn:
-            self._begun[count, seed] = meanwhile(self.posterior.draw, count, seed)
+            self._begun[count, seed] = submit(self.posterior.draw, count, seed)
 
-    def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], OutputError | None]]:
+    def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
         if (count, seed) not in self._drawn:
             begun = self._begun.pop((count, seed), None)
             draws = begun.result() if begun else self.posterior.draw(count, seed)
@@ -135,7 +135,7 @@ class Belief:
         return {}
 
     @cached_property
-    def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], OutputError | None]]]:
+    def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], DiscrepancySample | None]]]:
         return {}
 
 
@@ -164,7 +164,7 @@ class Prediction:
         return float(np.sum(kept) / len(self.episodes))
 
     def upper_rows(self, deviations: float) -> NDArray[np.float64] | None:
-        """mean + ``deviations`` sd of the measured rows (`EnvelopeLoop`) at each sample, shape (K, 2, rows); None where all failed."""
+        """mean + ``deviations`` sd of the measured rows (`ClosedLoop`) at each sample, shape (K, 2, rows); None where all failed."""
         rows = [self.loop.measured_rows(e) for e in self.episodes if e is not None]
         if not rows:
             return None
@@ -188,23 +188,25 @@ def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
     return [e for reader in readers if (e := reader()) is not None and len(e)]
 
 
-def believe(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5, unproved: float | None = None) -> Belief:
+def condition(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5, unproved: float | None = None) -> Ensemble:
     """What the traces of these trials say; the prior when there is none.
 
     ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell: how well each was
-    foretold by those before it is how far their successor can be trusted. ``unproved``: the same before one was foretold, else ``sure``.
+    predicted_before by those before it is how far their successor can be trusted. ``unproved``: the same before one was predicted_before, else ``sure``.
     """
     twin, every = loop.twin, episodes_of(trials)
     if not every:
-        return Belief(loop, twin.fit(()), None)
+        return Ensemble(loop, twin.fit(()), None)
     keys = _keys(every)
     for k in range(1, len(every)):
         # What was once judged stays so.
-        if keys[k] not in twin.foretold:
-            twin.foretold[keys[k]] = _learnt(loop, every[:k], keys[:k]).foretold(every[k])
-    foretold = [twin.foretold[key] for key in keys[1:]]
-    learnt = _learnt(loop, every, keys).scaled(scale_of(foretold, sure if foretold or unproved is None else unproved))
-    return Belief(loop, learnt.posterior, learnt, foretold[-1].mistake if foretold else 0.0)
+        if keys[k] not in twin.predicted_before:
+            twin.predicted_before[keys[k]] = _learnt(loop, every[:k], keys[:k]).predicted_before(every[k])
+    predicted_before = [twin.predicted_before[key] for key in keys[1:]]
+    learnt = _learnt(loop, every, keys).scaled(
+        calibrate_scale(predicted_before, sure if predicted_before or unproved is None else unproved)
+    )
+    return Ensemble(loop, learnt.posterior, learnt, predicted_before[-1].standardised_error if predicted_before else 0.0)
 
 
 def _learnt(loop: TwinLoop, episodes: Sequence[Episode], keys: Sequence[bytes]) -> Discrepancy:

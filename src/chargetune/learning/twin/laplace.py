@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.runtime.threads import each
+from chargetune.runtime.threads import parallel_map
 
 if TYPE_CHECKING:
     from chargetune.learning.twin.twin import Twin
 
-__all__ = ["Misfit"]
+__all__ = ["NegativeLogPosterior"]
 
 
-class Misfit:
+class NegativeLogPosterior:
     """|e|^2 + sum |(y - h(factor e)) / spread|^2 as the square of d + 1 numbers instead of as many as there are samples.
 
     With r the residuals and J their slopes, the triangle R of [J r] = Q R has the same J'J, J'r and r'r, which is all that a
@@ -44,7 +44,7 @@ class Misfit:
     def _known(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
         if not np.array_equal(e, self._at):
             own = np.hstack([np.eye(len(e)), e[:, None]])
-            squares = each(self._square, [e] * len(self._inputs), self._inputs, self._weights, self._wanted)
+            squares = parallel_map(self._square, [e] * len(self._inputs), self._inputs, self._weights, self._wanted)
             total = sum(squares, start=own.T @ own)
             # Where the data fit to the last digit nothing is left of the last pivot but rounding.
             total[-1, -1] += np.finfo(float).eps * (1.0 + np.trace(total))

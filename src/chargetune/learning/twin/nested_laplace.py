@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-__all__ = ["Section", "sections"]
+__all__ = ["Section", "nested_laplace"]
 
 # Sections are one of Laplace's standard deviations apart. Each is half as wide: their sum is flat between two that are as likely.
 WIDTH = 0.5
@@ -43,7 +43,7 @@ class Section(NamedTuple):
     root: NDArray[np.float64]
 
 
-def sections(loss: Loss, mode: NDArray[np.float64], root: NDArray[np.float64], entries: Sequence[int]) -> list[Section]:
+def nested_laplace(loss: Loss, mode: NDArray[np.float64], root: NDArray[np.float64], entries: Sequence[int]) -> list[Section]:
     """p(e) as a sum of Gaussians along one of the ``entries`` of e; none where Laplace's, of this mode and root, says as much.
 
     Nor where the density changes too fast for them.

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     pass
 
-__all__ = ["blocks"]
+__all__ = ["binned_residuals"]
 
 # Stretches of an episode over which residuals are averaged: what a model cannot represent changes slowly.
-BLOCKS = 40
+BINS = 40
 
 
 # Neighbouring stretches that err together: so many count as one.
-TOGETHER = 4.0
+CORRELATED_BINS = 4.0
 
 
-def blocks(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means over `BLOCKS` stretches, of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= BLOCKS, n)."""
-    parts = min(BLOCKS, len(values))
+def binned_residuals(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means over `BINS` stretches, of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= BINS, n)."""
+    parts = min(BINS, len(values))
     sizes = np.full(parts, len(values) // parts) + (np.arange(parts) < len(values) % parts)
     starts = np.cumsum(sizes) - sizes
     seen = np.isfinite(values)

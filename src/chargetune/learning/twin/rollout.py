@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from chargetune.runtime.cache import built_once
 from chargetune.runtime.compiler import compile_library, find_compiler
-from chargetune.runtime.hoisting import parametric
-from chargetune.runtime.numpy_call import evaluated
+from chargetune.runtime.hoisting import hoist
+from chargetune.runtime.numpy_call import numpy_call
 from chargetune.runtime.split import split
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def _evaluated(key: _Key, which: int, inputs: NDArray[np.float64], m: NDArray[np
     """The function of that number at several m (n, d), each under several inputs (episodes, K, nu): one call, n * episodes results."""
     count = len(m) * len(inputs)
     given = [np.repeat(m, len(inputs), axis=0), *(np.tile(one, (count, 1)) for one in _numbers(key.twin)), np.tile(inputs, (len(m), 1, 1))]
-    (out,) = evaluated(_mapped(key, inputs.shape[1], which, count), *given)
+    (out,) = numpy_call(_mapped(key, inputs.shape[1], which, count), *given)
     return out
 
 
@@ -129,8 +129,8 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     fixed = [m, nominal, begin]
     # Row by row, so that the result reshapes to (interval, end, output, unknown).
     slopes = ca.vec(ca.vertcat(slope_start, slope_end).T)
-    plain, of_plain = parametric("plain", [x, u], fixed, [after, ca.vertcat(start, end)])
-    with_slopes, of_slopes = parametric("with_slopes", [x, sensitivity, u], fixed, [after, ahead, slopes])
+    plain, of_plain = hoist("plain", [x, u], fixed, [after, ca.vertcat(start, end)])
+    with_slopes, of_slopes = hoist("with_slopes", [x, sensitivity, u], fixed, [after, ahead, slopes])
 
     inputs = ca.MX.sym("inputs", nu, count)
     given = [ca.MX.sym(name, e.shape[0]) for name, e in zip(("m", "nominal", "begin"), fixed, strict=True)]

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from chargetune.episode.episode import Episode
-from chargetune.learning.twin.laplace import Misfit
-from chargetune.learning.twin.nested_laplace import sections
+from chargetune.learning.twin.laplace import NegativeLogPosterior
+from chargetune.learning.twin.nested_laplace import nested_laplace
 from chargetune.learning.twin.posterior import Posterior
-from chargetune.learning.twin.residuals import TOGETHER, blocks
+from chargetune.learning.twin.residuals import CORRELATED_BINS, binned_residuals
 from chargetune.learning.twin.rollout import (
     AT_ONCE,
     _evaluated,
@@ -34,10 +34,10 @@ from chargetune.learning.twin.rollout import (
     _slot,
 )
 from chargetune.model.model import Model
-from chargetune.runtime.threads import each
+from chargetune.runtime.threads import parallel_map
 
 if TYPE_CHECKING:
-    from chargetune.learning.twin.calibration import Foretold
+    from chargetune.learning.twin.calibration import PredictionCheck
     from chargetune.learning.twin.discrepancy import Discrepancy
 
 __all__ = ["Twin", "Uncertain"]
@@ -81,9 +81,9 @@ class Twin:
     """A `Model` of the plant, what of it is unknown, and which outputs are measured with what noise.
 
     ``noise_sd`` maps the measured outputs to the standard deviation of one sample, ``start`` the states at the start of every
-    trial to their nominal value (others are 0). ``error_sd`` is by how much at least an output may be off at the largest input
+    trial to their nominal value (others are 0). ``discrepancy_sd_floor`` is by how much at least an output may be off at the largest input
     where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input, down to the
-    share ``error_at_rest`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does.
+    share ``floor_at_zero_input`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does.
     Raises ValueError for what the model does not have.
     """
 
@@ -91,8 +91,8 @@ class Twin:
     unknowns: tuple[Uncertain, ...]
     noise_sd: Mapping[str, float]
     start: Mapping[str, float] = field(default_factory=dict)
-    error_sd: Mapping[str, float] = field(default_factory=dict)
-    error_at_rest: float = 0.0
+    discrepancy_sd_floor: Mapping[str, float] = field(default_factory=dict)
+    floor_at_zero_input: float = 0.0
 
     def __post_init__(self) -> None:
         model = self.model
@@ -108,7 +108,7 @@ class Twin:
         named = (
             ("noise_sd", outputs, model.output_names),
             ("start", self.start, model.state_names),
-            ("error_sd", self.error_sd, outputs),
+            ("discrepancy_sd_floor", self.discrepancy_sd_floor, outputs),
         )
         for label, given, allowed in named:
             unknown = sorted(set(given) - set(allowed))
@@ -123,8 +123,8 @@ class Twin:
         return tuple(1 if one.kind in ("start", "bias") else self.model.parameter_blocks[one.name] for one in self.unknowns)
 
     @cached_property
-    def foretold(self) -> dict[bytes, Foretold]:
-        """How well episodes were foretold, as far as it is known (`belief.believe`)."""
+    def predicted_before(self) -> dict[bytes, PredictionCheck]:
+        """How well episodes were predicted_before, as far as it is known (`ensemble.condition`)."""
         return {}
 
     @cached_property
@@ -199,7 +199,7 @@ class Twin:
         function = partial(_evaluated, _Key(self), which, padded)
         several, d = m.shape[:-1], m.shape[-1]
         rows = m.reshape(-1, d)
-        parts = each(function, [rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)]) if len(rows) > 1 else [function(rows)]
+        parts = parallel_map(function, [rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)]) if len(rows) > 1 else [function(rows)]
         out = np.concatenate(parts).reshape(len(rows), *padded.shape[:2], *shape)
         return [out[:, k, : len(u)].reshape(*several, len(u), *shape) for k, u in enumerate(inputs)]
 
@@ -212,7 +212,7 @@ class Twin:
 
         With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with
         the variance it adds. Where the means of whole stretches are not zero, neighbouring residuals have one cause, and all
-        samples of `TOGETHER` stretches count as one. ``way`` are the modes that a fit of most of these episodes went through: each of
+        samples of `CORRELATED_BINS` stretches count as one. ``way`` are the modes that a fit of most of these episodes went through: each of
         its searches begins where that one's ended. Without episodes it is the prior.
         """
         names, factor = list(self.noise_sd), self.prior_factor
@@ -223,7 +223,7 @@ class Twin:
         for k in range(1 + REFITS):
             known = bool(data) and k < len(way)
             begin, ftol = (np.linalg.solve(factor, way[k]), FTOL_KNOWN) if known else (e, FTOL)
-            misfit = Misfit(self, data, spread)
+            misfit = NegativeLogPosterior(self, data, spread)
             found = least_squares(misfit.values, begin, jac=misfit.slopes, method="trf", x_scale=1.0, max_nfev=30, ftol=ftol, xtol=XTOL)
             e, cost_jacobian = found.x, found.jac
             modes.append(factor @ e)
@@ -239,14 +239,14 @@ class Twin:
         curvature, directions = np.linalg.eigh(cost_jacobian.T @ cost_jacobian)
         root = factor @ (directions / np.sqrt(curvature))
         seen = tuple((u, np.isfinite(y)) for u, y in data)
-        parts = sections(misfit, np.asarray(e, np.float64), np.asarray(directions / np.sqrt(curvature)), self.scalars) if data else []
+        parts = nested_laplace(misfit, np.asarray(e, np.float64), np.asarray(directions / np.sqrt(curvature)), self.scalars) if data else []
         apart = tuple((one.share, Posterior(self, factor @ one.mode, factor @ one.root, unmodelled, spread, seen)) for one in parts)
         return Posterior(self, factor @ e, root, unmodelled, spread, seen, apart, tuple(modes))
 
 
 def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From residuals: (standard deviation of what the model cannot represent, that of a sample as the likelihood takes it)."""
-    means, counts = (np.concatenate(parts) for parts in zip(*(blocks(r) for r in left), strict=True))
+    means, counts = (np.concatenate(parts) for parts in zip(*(binned_residuals(r) for r in left), strict=True))
     known = counts > 0
     size = np.maximum(known.sum(axis=0), 1)
     block = np.where(known, means, 0.0) ** 2 - np.where(known, noise**2 / np.maximum(counts, 1.0), 0.0)
@@ -254,4 +254,4 @@ def _unmodelled(left: list[NDArray[np.float64]], noise: NDArray[np.float64]) -> 
     square = np.concatenate([r.reshape(-1, len(noise)) for r in left]) ** 2
     whole = np.maximum(np.nanmean(np.where(np.isfinite(square).any(axis=0), square, 0.0), axis=0) - noise**2, slow)
     together = counts.sum(axis=0) / size
-    return np.sqrt(whole), np.sqrt(noise**2 + TOGETHER * together * slow + (whole - slow))
+    return np.sqrt(whole), np.sqrt(noise**2 + CORRELATED_BINS * together * slow + (whole - slow))

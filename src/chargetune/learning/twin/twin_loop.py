@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.learning.closed_loop.loop import EnvelopeLoop
+from chargetune.learning.closed_loop.loop import ClosedLoop
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin.discrepancy import OutputError
+from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.twin import Twin
 
-__all__ = ["Case", "TracedTrial", "TwinLoop"]
+__all__ = ["Member", "TracedTrial", "TwinLoop"]
 
-Case = tuple[NDArray[np.float64], NDArray[np.float64], OutputError | None]
+Member = tuple[NDArray[np.float64], NDArray[np.float64], DiscrepancySample | None]
 """One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
 
 
@@ -28,7 +28,7 @@ class TracedTrial(TrialLike, Protocol):
     def episode(self) -> Callable[[], Episode | None] | None: ...
 
 
-class TwinLoop(EnvelopeLoop, Protocol):
+class TwinLoop(ClosedLoop, Protocol):
     """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
 
     @property
@@ -39,7 +39,7 @@ class TwinLoop(EnvelopeLoop, Protocol):
         """Signals of an episode, with their ranges, that the error of the twin depends on."""
         ...
 
-    def simulate(self, cases: Sequence[Case]) -> list[Episode | None]:
+    def simulate(self, cases: Sequence[Member]) -> list[Episode | None]:
         """A noise-free episode of each case, None where it fails; the third of a case is added to the measured outputs."""
         ...
 

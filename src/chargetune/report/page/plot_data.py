@@ -12,7 +12,7 @@ from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.episode import Episode
 from chargetune.report.figures.trajectories import LABELS, curves
 from chargetune.report.figures.tuned_curves import SOC, backoff_values, current_limit_values, resistance_values
-from chargetune.report.study_view import Reading, StudyView
+from chargetune.report.study_view import ReadStudy, StudyView
 
 __all__ = ["POINTS", "profiles", "rounded", "signals", "thin", "trial_drawing"]
 
@@ -21,7 +21,7 @@ POINTS = 1500
 NEAR_V = (0.06, 0.08)
 
 
-def trial_drawing(view: StudyView, reading: Reading, points: int = POINTS) -> dict[str, Any]:
+def trial_drawing(view: StudyView, reading: ReadStudy, points: int = POINTS) -> dict[str, Any]:
     """``panels`` over time and ``profiles`` over SOC of one trial; ``message`` says why there is no curve."""
     trial, episode = reading.trial, reading.episode
     return {
