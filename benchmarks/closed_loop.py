@@ -29,8 +29,8 @@ SEEDS = (None, 0, 1, 2, 3, 4)
 HORIZONS = (5, 10, 20, 40)
 FRESH = """
 import time
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import ChargingProblem
 begin = time.perf_counter()
 ChargingProblem(default_cell(), mismatch_seed=0, overpotential="exact").episode()
 print(time.perf_counter() - begin)

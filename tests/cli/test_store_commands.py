@@ -26,7 +26,7 @@ nodes = 3
 lower_V = 0.0
 upper_V = 0.2
 """
-OLD = Path(__file__).parents[1] / "study" / "data" / "schema-1.db"
+OLD = Path(__file__).parents[1] / "study" / "store" / "data" / "schema-1.db"
 
 
 @pytest.fixture

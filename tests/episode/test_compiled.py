@@ -175,8 +175,8 @@ def test_refuses_what_step_by_step_refuses(tank_controller, tank_plant, argument
 # A fresh process: prints whether it is compiled, and the last input to the last bit.
 PROGRAM = """
 import sys
-from chargetune.battery.cell import default_cell
-from chargetune.battery.charging import ChargingProblem
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.problem import ChargingProblem
 problem = ChargingProblem(default_cell(), mismatch_seed=0, steps=8, horizon=2)
 print(problem._episodes.compiled, problem.episode().input[-1, 0].hex())
 """

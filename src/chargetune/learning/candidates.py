@@ -1,102 +1,116 @@
-"""What one ask works with: the ensemble after these trials, and what it foretells of a theta."""
+"""Candidates for the next theta: the best on the expected plant, with the margins that an ensemble of plants asks for."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.learning.candidate_choice import Candidate, choose_candidate
-from chargetune.learning.closed_loop.covering import covering
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.search import Search
+from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.ensemble import Ensemble, Prediction
-from chargetune.learning.twin.twin_loop import TwinLoop
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["Proposal"]
+__all__ = ["Candidate", "Proposal"]
 
-# Plants of an ensemble; the standard error of a probability of 0.95 is 0.039. Twice as many before the twin has predicted_before a trial:
-# its plants are far apart, and the sd of few of them decided by chance whether the second trial was 2 mV below the limit or 4 above.
-DRAWS, DRAWS_UNPROVED = 32, 64
-# Of a limit's tolerance, what the upper side of the prediction may use after an envelope step and a search. The rest is for what the few
-# standard deviations that are taken back without a promise do not hold.
-AIMED = 0.5
-# Iterations of the search that follows the envelope steps.
-POLISHING = 8
-# Of the objective, what an iteration of it has to promise, and it in all.
-WON = 2e-3
-# Of the objective, what another search would have to win.
-WORTH = 0.01
+# Added to the seed of the plants that candidates are chosen by: that of those which judge.
+FRESH = 104_729
+
+Candidate = tuple[NDArray[np.float64], Prediction]
+"""A theta and what the ensemble of plants does with it."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """One ask for thetas of ``space``, with what is believed of the plant after ``trials``; ``seed`` is of its draws."""
+    """The search for the next theta of ``space`` after ``trials``; ``seed`` is that of the plants that it is judged on.
 
-    loop: TwinLoop
+    A candidate is accepted where it keeps every limit on at least the share ``probability`` of the ensemble.
+    """
+
     space: ParameterSpace
     ensemble: Ensemble
     trials: Sequence[TrialLike]
+    probability: float
     seed: int
-    aimed: ClassVar[float] = AIMED
-
-    def draw(self) -> None:
-        """Begins to draw the plants of `predicted`, while something else goes on."""
-        self.ensemble.draw(self.draws, self.seed)
-
-    @property
-    def draws(self) -> int:
-        """Plants of an ensemble."""
-        return DRAWS if self.ensemble.proved else DRAWS_UNPROVED
-
-    def predicted(self, theta: NDArray[np.float64]) -> Prediction:
-        """What an ensemble of plants does with theta, the same plants for every theta."""
-        return self.ensemble.predict(theta, self.draws, self.seed)
-
-    def tried(self, trial: TrialLike) -> Candidate:
-        """The theta of a trial with what an ensemble of plants does under the inputs of that trial, where they were recorded."""
-        reader = getattr(trial, "episode", None)
-        episode = None if reader is None else reader()
-        theta = np.array(trial.theta)
-        return self.candidate(theta) if episode is None else (theta, self.ensemble.replayed(episode, DRAWS, self.seed))
 
     def candidate(self, theta: NDArray[np.float64]) -> Candidate:
-        return theta, self.predicted(theta)
+        """A theta with what the ensemble does with it, the same plants for every theta."""
+        return theta, self.ensemble.predict(theta, self.seed)
 
-    def covered(self, candidate: Candidate, deviations: float) -> NDArray[np.float64] | None:
-        """An envelope step by so many sd of the ensemble; None where there is nothing to step from."""
-        theta, predicted = candidate
-        expected, rows = self.ensemble.central(theta), predicted.upper_rows(deviations)
-        if expected is None or rows is None:
-            return None
-        return covering(self.loop.controller, expected, theta, rows - self.aimed * self.loop.row_tolerances)
+    def holds(self, theta: NDArray[np.float64]) -> bool:
+        """Whether theta is accepted by fresh plants, which nothing was chosen by.
 
-    def polished(self, candidate: Candidate, deviations: float) -> Candidate:
-        """From a candidate on, the best theta on the expected plant that keeps so many sd of the candidate's ensemble back."""
-        theta, predicted = candidate
-        expected = self.ensemble.central(theta)
-        score = None if expected is None else self.loop.score(expected)
-        if score is None or not predicted.scores:
-            return candidate
-        margin = np.nan_to_num(predicted.upper_windows(deviations) - windows_of(score))
-        search = Search(self.loop, self.ensemble.expected, self.space, margin, self.aimed)
-        start = self.space.to_unit(theta)
-        search.refine(start, POLISHING, WON)
-        return self.candidate(self.space.from_unit(search.best()))
+        Of many candidates that are judged by the same plants those are found that just these allow: their share says too much.
+        """
+        fresh = self.ensemble.predict(theta, self.seed + FRESH, self.ensemble.settings.judges)
+        return fresh.probability() >= self.probability
 
-    def as_good(self, theta: NDArray[np.float64], other: NDArray[np.float64], share: float = WORTH) -> bool:
-        """Whether the objective expected of theta is that of another, less this share of it at most."""
-        mine, its = self.ensemble.scores([theta, other])
-        return mine is not None and its is not None and mine.objective >= its.objective - share * abs(its.objective)
+    def accepts(self, candidate: Candidate) -> bool:
+        return candidate[1].probability() >= self.probability
 
-    def choose_candidate(self, candidates: Sequence[Candidate]) -> Candidate:
-        return choose_candidate(self.ensemble, self.space, self.trials, candidates, self.seed)
+    def backtrack(self, safe: NDArray[np.float64], aim: NDArray[np.float64]) -> Candidate | None:
+        """The longest part of the way from an accepted theta to what is aimed at that is accepted; None where no part is."""
+        parts = (self.candidate(safe + share * (aim - safe)) for share in self.ensemble.settings.steps_back)
+        return next((part for part in parts if self.accepts(part)), None)
 
-    def moved(self, before: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-        """The largest change of an entry, as a share of its range."""
-        return float(np.max(np.abs(theta - before) / (self.space.upper - self.space.lower)))
+    def search(self) -> tuple[list[Candidate], Candidate]:
+        """(accepted candidates, the best first; the candidate found last).
+
+        Each round solves
+
+            max objective  s.t.  excess <= tolerance - margin  on the expected plant,
+
+        with a proximal term around the best trial (`solve_slp`). The margin of a round is the difference between the upper bound over the
+        ensemble and the expected excess at the theta of the round before, by window; 0 in the first round. A margin falls with the
+        current that it leads to, so from the third round on it is the mean of the new one and the one before.
+        """
+        settings, u = self.ensemble.settings, self._start
+        margin: NDArray[np.float64] | float = 0.0
+        accepted: list[tuple[float, Candidate]] = []
+        for k in range(settings.rounds):
+            before = u
+            start = min((u, self._centre), key=lambda point: self.expected.merit(point, margin))
+            u = self.expected.refine(start, settings.iterations, settings.gain, margin, settings.proximal, self._centre)
+            candidate, score = self.candidate(self.space.from_unit(u)), self.expected.score(u)
+            if score is None:
+                break
+            if self.accepts(candidate):
+                accepted.append((score.objective, candidate))
+            if k and np.max(np.abs(u - before)) < settings.settled:
+                break
+            new = np.maximum(np.nan_to_num(candidate[1].upper_windows((1 + self.probability) / 2) - windows_of(score)), 0.0)
+            margin = new if k == 0 else (margin + new) / 2
+        ranked = [one for _, one in sorted(accepted, key=lambda one: -one[0])]
+        if ranked and not self.accepts(candidate):
+            further = self.backtrack(ranked[0][0], candidate[0])
+            ranked = [further, *ranked] if further else ranked
+        return ranked, candidate
+
+    @cached_property
+    def expected(self) -> Search:
+        """Verdicts on the expected plant."""
+        return Search(self.ensemble.loop, self.ensemble.expected, self.space, self.ensemble.settings.aim)
+
+    @cached_property
+    def kept(self) -> list[NDArray[np.float64]]:
+        """The thetas that kept every limit as measured, the best first."""
+        known = [(t.score.objective, np.array(t.theta)) for t in self.trials if t.score is not None and t.score.feasible]
+        return [theta for _, theta in sorted(known, key=lambda one: -one[0])]
+
+    @property
+    def _centre(self) -> NDArray[np.float64]:
+        return self.space.to_unit(self.kept[0] if self.kept else np.array(self.trials[-1].theta))
+
+    @property
+    def _start(self) -> NDArray[np.float64]:
+        """The best on the expected plant of the thetas tried so far, theta_0 and Sobol's points."""
+        space = self.space
+        pool = sobol_points(space.dimension, self.seed, 0, self.ensemble.settings.pool)
+        points = [*(space.to_unit(np.array(t.theta)) for t in self.trials), space.to_unit(space.default), *pool]
+        self.expected.scores(points)
+        return min(points, key=self.expected.merit)

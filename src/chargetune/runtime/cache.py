@@ -34,17 +34,21 @@ if hasattr(os, "register_at_fork"):
 
 
 class Built:
-    """Keeps what was built under its key; of more than ``most`` the one that was not asked for the longest goes first."""
+    """Keeps what was built under its key; of more than ``most`` the one that was not asked for the longest goes first.
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    With ``casadi`` what is built makes CasADi expressions, and one thread at a time does. What is built by several threads must not wait
+    for that lock, which they need themselves.
+    """
+
+    def __init__(self, most: int, *, casadi: bool = True) -> None:
+        self._most, self._casadi = most, casadi
         self._kept: OrderedDict[Hashable, tuple[Any]] = OrderedDict()
 
     def get(self, key: Hashable, build: Callable[[], T]) -> T:
         """What ``build`` makes. Other threads that build wait; one that asks for what is kept does not."""
         found = self._kept.get(key)
         if found is None:
-            with _building:
+            with _building if self._casadi else contextlib.nullcontext():
                 found = self._kept.get(key)
                 if found is None:
                     found = self._kept[key] = (build(),)

@@ -210,7 +210,7 @@ class TestContract:
 
     def test_a_wall_clock_that_jumps_changes_nothing(self, opened, tmp_path, monkeypatch):
         jumps = itertools.cycle(["2031-01-01T00:00:00.000+00:00", "1999-12-31T23:59:59.999+00:00", "2026-06-01T12:00:00.000+00:00"])
-        for module in ("store", "study"):
+        for module in ("store.store", "study"):
             monkeypatch.setattr(f"chargetune.study.{module}.utc_now", lambda: next(jumps))
         for trials in (3, 7):
             with open_study(opened, batch=2) as study:

@@ -131,9 +131,12 @@ class ChargingTwin:
         return {}
 
     def _made(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
+        from chargetune.learning.twin.rollout import parameters
+        from chargetune.learning.twin.rollout import start_state as begin
+
         sizes, own = self.twin.model.parameter_blocks, self._loop.plant
-        values = np.split(self.twin.parameters(unknowns), np.cumsum(list(sizes.values()))[:-1])
-        start = dict(zip(own.model.state_names, (float(v) for v in self.twin.start_state(unknowns)), strict=True))
+        values = np.split(parameters(self.twin, unknowns), np.cumsum(list(sizes.values()))[:-1])
+        start = dict(zip(own.model.state_names, (float(v) for v in begin(self.twin, unknowns)), strict=True))
         return replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
 
     def violation(self, episode: Episode) -> float:

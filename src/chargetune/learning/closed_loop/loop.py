@@ -12,7 +12,7 @@ from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score, in_tolerances
 
-__all__ = ["ClosedLoop", "Simulate", "samples_of", "windows_of"]
+__all__ = ["ClosedLoop", "JudgedLoop", "Simulate", "samples_of", "windows_of"]
 
 Simulate = Callable[[Sequence[NDArray[np.float64]]], list[Episode | None]]
 """thetas -> the episode of each on one simulated plant, None where it fails."""
@@ -34,7 +34,7 @@ def windows_of(score: Score, share: float = 1.0) -> NDArray[np.float64]:
 def samples_of(
     score: Score, samples: Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]], share: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.int_]]:
-    """The samples (`TwinLoop.samples`) that the windows of `windows_of` are the largest of, and the entry of each, shapes (n,)."""
+    """The samples (`JudgedLoop.samples`) that the windows of `windows_of` are the largest of, and the entry of each, shapes (n,)."""
     values, windows, first = [np.zeros(0)], [np.zeros(0, dtype=int)], 0
     for name in score.excess:
         tolerance = score.tolerance.get(name, 0.0)
@@ -62,4 +62,16 @@ class ClosedLoop(Protocol):
     @property
     def row_tolerances(self) -> NDArray[np.float64]:
         """The excess of each row that is still called kept, shape (rows,)."""
+        ...
+
+
+class JudgedLoop(Protocol):
+    """Verdicts on episodes, sample by sample."""
+
+    def score(self, episode: Episode) -> Score | None:
+        """The verdict on an episode; None when it has none."""
+        ...
+
+    def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        """By limit of the score the excess of every sample, in its unit, and the window of its profile that it counts in, 0 without one."""
         ...

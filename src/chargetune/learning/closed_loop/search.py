@@ -1,4 +1,4 @@
-"""The best theta on one simulated plant: envelope steps to come near, linear programs on every sample to arrive."""
+"""The best theta on one simulated plant, by sequential linear programs on every sample."""
 
 from __future__ import annotations
 
@@ -9,52 +9,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.episode.score import Score
-from chargetune.learning.closed_loop.covering import covering
-from chargetune.learning.closed_loop.loop import Simulate, samples_of, windows_of
+from chargetune.learning.closed_loop.loop import JudgedLoop, Simulate, samples_of, windows_of
 from chargetune.learning.closed_loop.slp import Point, solve_slp
-from chargetune.learning.twin.twin_loop import TwinLoop
 from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["Search"]
 
-# Of a limit's tolerance, by how much less than what it accepts the search aims at: it may end a little on the wrong side.
-ROUNDING = 0.05
-# Of the objective, what the last step of a search promises at least.
-LEAST = 1e-6
+# Safety gap as a share of the tolerance: a linear program ends a little on the wrong side.
+GAP = 0.05
 
 
 class _Seen(NamedTuple):
-    """The verdict on an episode, and the samples that it is on (`TwinLoop.samples`)."""
+    """The verdict on an episode, and the samples that it is on (`JudgedLoop.samples`)."""
 
     score: Score
     samples: Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]
 
 
 class Search:
-    """Verdicts on the episodes of one plant by point of the unit cube, remembered.
+    """Verdicts on the episodes of one plant by point of the unit cube, remembered; points are compared by what margins are kept.
 
-    ``margin`` is added to the excess of each window, in tolerances; ``share`` of the tolerance may be used, the rest is left to noise and
-    to what the twin does not know.
+    ``margin`` is added to the excess of each window, in tolerances; ``share`` of the tolerance may be used.
     """
 
-    def __init__(
-        self,
-        loop: TwinLoop,
-        simulate: Simulate,
-        space: ParameterSpace,
-        margin: NDArray[np.float64] | float = 0.0,
-        share: float = 0.0,
-    ) -> None:
-        self._loop, self._simulate, self._space, self._margin, self._share = loop, simulate, space, margin, share
+    def __init__(self, loop: JudgedLoop, simulate: Simulate, space: ParameterSpace, share: float = 0.0) -> None:
+        self._loop, self._simulate, self._space, self._share = loop, simulate, space, share
         self._seen: dict[bytes, _Seen | None] = {}
 
     def score(self, u: NDArray[np.float64]) -> Score | None:
+        """The verdict at one point; None where there is no episode or it has none."""
         return self.scores([u])[0]
-
-    def samples(self, u: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int_]] | None:
-        """The samples at u that `windows_of` are the largest of, and the window of each (`samples_of`); None without a verdict."""
-        seen = self._at(u)
-        return None if seen is None else samples_of(seen.score, seen.samples)
 
     def scores(self, points: Sequence[NDArray[np.float64]]) -> list[Score | None]:
         """Verdicts at several points, simulated together."""
@@ -65,51 +49,35 @@ class Search:
             self._seen[u.tobytes()] = None if episode is None or score is None else _Seen(score, self._loop.samples(episode))
         return [None if seen is None else seen.score for seen in (self._seen[u.tobytes()] for u in points)]
 
-    def _at(self, u: NDArray[np.float64]) -> _Seen | None:
-        self.scores([u])
-        return self._seen[u.tobytes()]
-
-    def envelope(self, start: NDArray[np.float64], iterations: int) -> None:
-        """From ``start``, ``iterations`` times the theta whose predictions cover what the plant did last; all are remembered."""
-        theta = self._space.from_unit(start)
-        for _ in range(iterations):
-            episode = self._simulate([theta])[0]
-            if episode is None:
-                return
-            theta = covering(self._loop.controller, episode, theta, self._loop.measured_rows(episode))
-            self.score(self._space.to_unit(theta))
-
-    def refine(self, start: NDArray[np.float64], iterations: int, gain: float = LEAST) -> None:
-        """From ``start`` to the best point near it (`solve_slp`); every point it visits is remembered.
+    def refine(
+        self,
+        start: NDArray[np.float64],
+        iterations: int,
+        gain: float,
+        margin: NDArray[np.float64] | float = 0.0,
+        proximal: float = 0.0,
+        centre: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """From ``start`` to the best point near it (`solve_slp`).
 
         Its rows are the samples, not the windows of the verdict: the largest of many that all ride their limit has a kink wherever
         another one becomes it, and what is linear about a kink leads nowhere.
         """
-        solve_slp(self._points, start, iterations, gain, ROUNDING)
 
-    def _points(self, points: Sequence[NDArray[np.float64]]) -> list[Point | None]:
-        self.scores(points)
-        return [None if seen is None else self._point(seen) for seen in (self._seen[u.tobytes()] for u in points)]
+        def points(us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
+            self.scores(us)
+            return [None if seen is None else self._point(seen, margin) for seen in (self._seen[u.tobytes()] for u in us)]
 
-    def _point(self, seen: _Seen) -> Point:
-        excess, window = samples_of(seen.score, seen.samples, self._share - ROUNDING)
-        return Point(-seen.score.objective, excess + (self._margin if np.ndim(self._margin) == 0 else np.asarray(self._margin)[window]))
+        return np.clip(solve_slp(points, start, iterations, gain, GAP, proximal, centre), 0.0, 1.0)
 
-    def merit(self, u: NDArray[np.float64]) -> float:
-        """The objective, to be minimised, and the worst violation at its price in `solve_slp`."""
-        seen = self._at(u)
-        return np.inf if seen is None else abs(seen.score.objective) * max(0.0, self._worst(seen)) - seen.score.objective
+    def _point(self, seen: _Seen, margin: NDArray[np.float64] | float) -> Point:
+        excess, window = samples_of(seen.score, seen.samples, self._share - GAP)
+        return Point(-seen.score.objective, excess + (margin if np.ndim(margin) == 0 else np.asarray(margin)[window]))
 
-    def best(self) -> NDArray[np.float64]:
-        """The seen point of the best objective that keeps the limits; else of the least excess."""
-
-        def rank(key: bytes) -> tuple[bool, float]:
-            seen = self._seen[key]
-            worst = self._worst(seen)
-            return worst > 0.0, -seen.score.objective if seen is not None and worst <= 0.0 else worst
-
-        return np.clip(np.frombuffer(min(self._seen, key=rank)), 0.0, 1.0)
-
-    def _worst(self, seen: _Seen | None) -> float:
-        """Of the windows, in tolerances; inf where there is no episode."""
-        return np.inf if seen is None else float(np.nanmax(windows_of(seen.score, self._share) + self._margin, initial=-np.inf))
+    def merit(self, u: NDArray[np.float64], margin: NDArray[np.float64] | float = 0.0) -> float:
+        """The objective, to be minimised, and the worst violation at the penalty that `solve_slp` begins with."""
+        score = self.score(u)
+        if score is None:
+            return np.inf
+        worst = float(np.nanmax(windows_of(score, self._share) + margin, initial=-np.inf))
+        return abs(score.objective) * max(0.0, worst) - score.objective

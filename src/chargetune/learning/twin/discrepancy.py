@@ -20,15 +20,15 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning.black_box.gaussian_process import fitted
 from chargetune.learning.black_box.optimize_acquisition import reproducible
-from chargetune.learning.twin.calibration import SCALES, PredictionCheck
 from chargetune.learning.twin.posterior import Posterior
-from chargetune.learning.twin.residuals import CORRELATED_BINS, binned_residuals
+from chargetune.learning.twin.residuals import binned_residuals, measured
+from chargetune.learning.twin.rollout import predict, predict_each
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.runtime.threads import parallel_map
 
 __all__ = ["Discrepancy", "DiscrepancySample"]
 
-# Prior medians of the length scales, as shares of each feature's range, and the common spread of their logarithm.
-LENGTH, LENGTH_SD = (0.15, 0.5, 0.5), 0.5
+# Relative to the prior variance: what keeps a covariance of neighbouring nodes from being singular to rounding.
 JITTER = 1e-8
 # Attempts of the search for hyperparameters, the first from the medians of their priors.
 ATTEMPTS = 5
@@ -39,12 +39,13 @@ class Discrepancy:
     """b_i(s) ~ GP(0, a_i^2 k(s, s')), k Matern 3/2: y_i = h_i(x, u, p) + b_i(s) + noise for each measured output i.
 
     s are ``features`` of an episode, signals with the range by which they are scaled: for a charge the SOC, the current and,
-    where it is measured, the temperature. The data are residuals, averaged over `BINS` stretches of each episode, because
+    where it is measured, the temperature. The data are residuals, averaged over bins of each episode, because
     neighbouring residuals have the same cause. The error of an output that is a state does not depend on the inputs among the features:
     it has the inertia of the state. For a draw of the twin's unknowns the process is conditioned on that draw's own
     residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
     k is known at the nodes of a table and linear in between, k(s, s') = w(s)' K w(s') with the shares w of the nodes around s, so
     that a sample drawn at the nodes is one of this process (Wilson and Nickisch, ICML 2015).
+    ``scale`` multiplies the standard deviation of the whole process: how far what is stated can be trusted (`calibration`).
     Hyperparameters: maximum a posteriori of the residuals at the mode (BoTorch), log-normal priors.
     Source: Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425.
     """
@@ -52,95 +53,48 @@ class Discrepancy:
     posterior: Posterior
     episodes: tuple[Episode, ...]
     features: Mapping[str, tuple[float, float]]
-    scale: float = 1.0
-    like: Discrepancy | None = field(default=None, repr=False)
+    settings: TwinSettings = field(default_factory=TwinSettings)
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.features) <= len(LENGTH):
-            raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {len(LENGTH)}")
+        most = len(self.settings.length_scales)
+        if not 1 <= len(self.features) <= most:
+            raise ValueError(f"discrepancy: features = {sorted(self.features)}, allowed are 1 to {most}")
 
-    def scaled(self, scale: float) -> Discrepancy:
-        """The same with another factor on the floor ``Twin.discrepancy_sd_floor``, not on what the residuals ask for, nor on the hyperparameters."""
-        return replace(self, scale=scale, like=self)
+    def mean(self, unknowns: NDArray[np.float64]) -> DiscrepancySample:
+        """What is expected of the discrepancy of a plant at ``unknowns`` (d,)."""
+        left = self._residuals(unknowns)
+        return DiscrepancySample(self, np.stack([part.gain @ left[:, i] for i, part in enumerate(self.stated)]))
 
-    def error(self, unknowns: NDArray[np.float64], seed: int | None = None) -> DiscrepancySample:
-        """The discrepancy that goes with a plant at ``unknowns``: its mean, or with a seed a sample."""
-        return self._error(self._residuals(unknowns), seed)
+    def samples(self, unknowns: NDArray[np.float64], scales: Sequence[float], seeds: Sequence[int]) -> list[DiscrepancySample]:
+        """A sample for each of several plants, unknowns of shape (plants, d), each with its scale and seed."""
+        levels = sorted(set(scales))
+        # They are large, and not kept.
+        parts = dict(zip(levels, parallel_map(self._scaled, levels), strict=True))
+        parallel_map(lambda part: part.root, [part for several in parts.values() for part in several])
+        return parallel_map(self._sample, self._residuals(unknowns), [parts[scale] for scale in scales], seeds)
 
-    def _error(self, left: NDArray[np.float64], seed: int | None) -> DiscrepancySample:
-        stream = None if seed is None else np.random.default_rng(seed)
-        tables = []
-        for i, part in enumerate(self._parts):
-            table = part.gain @ left[:, i]
-            if stream is not None:
-                table = table + part.root @ stream.standard_normal(len(table))
-            tables.append(table)
+    def _sample(self, left: NDArray[np.float64], parts: Sequence[_Part], seed: int) -> DiscrepancySample:
+        stream = np.random.default_rng(seed)
+        tables = [part.gain @ left[:, i] + part.root @ stream.standard_normal(len(part.gain)) for i, part in enumerate(parts)]
         return DiscrepancySample(self, np.stack(tables))
 
-    def errors(self, unknowns: NDArray[np.float64], seeds: Sequence[int]) -> list[DiscrepancySample]:
-        """A sample of `error` for each of several plants, unknowns of shape (plants, d)."""
-        parallel_map(lambda part: part.root, self._parts)
-        return parallel_map(self._error, self._residuals(unknowns), seeds)
+    @cached_property
+    def stated(self) -> tuple[_Part, ...]:
+        """The process of each output with the scale 1, conditioned on where the data are."""
+        return self._scaled(1.0)
 
-    def predicted_before(self, episode: Episode) -> PredictionCheck:
-        """How well an episode that was not learnt from was predicted, at its recorded inputs.
-
-        Each stretch of the episode differs by r ~ N(0, d_s^2 + v) from its prediction: d_s the standard deviation of the discrepancy with
-        the scale s (`scaled`), v from noise and unknowns. Neighbouring stretches err together, so `CORRELATED_BINS` of them count as one; and
-        each counts by the share of its prior variance that d_1^2 still is: what was measured before comes out as it was, however wrong
-        the process is elsewhere.
-        """
-        off = self._off(episode)
-        known = off.known
-        if not known.any():
-            return PredictionCheck(np.zeros_like(SCALES), 0.0)
-        variance = off.unmodelled[:, known] + off.rest[known]
-        chance = -0.5 * np.sum(off.novel[known] * (np.log(variance) + off.square[known] / variance), axis=1) / CORRELATED_BINS
-        stated = np.array([self.posterior.twin.discrepancy_sd_floor.get(name, 0.0) for name in self.posterior.twin.noise_sd])
-        return PredictionCheck(chance, float(np.sqrt(np.mean((off.square / (off.rest + stated**2))[known]))))
-
-    def _off(self, episode: Episode) -> _Off:
-        posterior, twin = self.posterior, self.posterior.twin
-        predicted = twin.predict(posterior.mode, episode.input)
-        columns = [episode.output_names.index(name) for name in twin.noise_sd]
-        filled = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
-        filled.output_start[:, columns], filled.output_end[:, columns] = predicted[:, 0], predicted[:, 1]
-        filled = self.error(posterior.mode)(filled)
-        left, counts = binned_residuals(twin.measured(episode) - twin.measured(filled))
-        noise = np.array(list(twin.noise_sd.values()))
-        own = binned_residuals(posterior.predicted_sd(episode.input) ** 2)[0] - posterior.discrepancy_sd**2 - noise**2
-        weights = self.lookup_table.weights(self._at(episode))
-        left_over = np.stack([part.variance(weights) for part in self._parts], axis=1)
-        before = np.stack([part.variance_before(weights) for part in self._parts], axis=1)
-        rest = np.maximum(own, 0.0) + noise**2 / np.maximum(counts, 1.0)
-        novel = np.divide(left_over, before, out=np.zeros_like(before), where=before > 0)
-        return _Off(left**2, self._variances(weights), novel, rest, (counts > 0) & np.isfinite(left))
-
-    def _variances(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance of the process with each of `SCALES` (`scaled`), at ``weights`` of the nodes (K, nodes); shape (scales, K, outputs)."""
-        data, seen = self.data, len(self.data.weights)
-        every = np.vstack([data.weights, weights])
-        out = np.empty((len(SCALES), len(weights), len(self.fitted)))
-        for i, (one, floor) in enumerate(zip(self.fitted, self._floors, strict=True)):
-            asked, stated = one.variance * one.kernel, np.outer(floor, floor) * one.kernel
-            # From all nodes to the stretches, which are fewer, once for all scales.
-            fixed, growing = every @ asked @ every.T, every @ stated @ every.T
-            for k, square in enumerate(SCALES**2):
-                both = fixed + square * growing
-                noise = data.variance[:, i] + JITTER * (asked[0, 0] + square * stated[0, 0])
-                cross = both[:seen, seen:]
-                taken = np.sum(cross * cho_solve(cho_factor(both[:seen, :seen] + np.diag(noise), lower=True), cross), axis=0)
-                out[k, :, i] = np.maximum(np.diag(both)[seen:] - taken, 0.0)
-        return out
+    def _scaled(self, scale: float) -> tuple[_Part, ...]:
+        data = self.data
+        return tuple(_part(scale**2 * prior, data.variance[:, i], data.weights) for i, prior in enumerate(self._priors))
 
     @cached_property
     def lookup_table(self) -> LookupTable:
         """The nodes at which a sample is drawn together."""
         return LookupTable.over(self.features, list(self.posterior.twin.noise_sd))
 
-    def _at(self, episode: Episode) -> NDArray[np.float64]:
+    def at(self, episode: Episode) -> NDArray[np.float64]:
         """Mean features of every stretch, shape (stretches, features)."""
-        return binned_residuals(self.signals(episode))[0]
+        return binned_residuals(self.signals(episode), self.settings.bins)[0]
 
     def signals(self, episode: Episode) -> NDArray[np.float64]:
         """Features at both ends of every interval, shape (intervals, 2, features).
@@ -151,7 +105,7 @@ class Discrepancy:
         if np.all(np.isfinite(out)):
             return out
         twin = self.posterior.twin
-        predicted = dict(zip(twin.noise_sd, np.moveaxis(twin.predict(self.posterior.mode, episode.input), -1, 0), strict=True))
+        predicted = dict(zip(twin.noise_sd, np.moveaxis(predict(twin, self.posterior.mode, episode.input), -1, 0), strict=True))
         for i, name in enumerate(self.features):
             seen = np.isfinite(out[..., i])
             if not seen.any() and name not in predicted:
@@ -165,21 +119,19 @@ class Discrepancy:
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean residual of every stretch, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
         twin, several = self.posterior.twin, unknowns.shape[:-1]
-        predicted = twin.predict_each(unknowns, [e.input for e in self.episodes])
+        predicted = predict_each(twin, unknowns, [e.input for e in self.episodes])
         out = []
         for episode, values in zip(self.episodes, predicted, strict=True):
-            measured = twin.measured(episode)
-            means = [binned_residuals(measured - own)[0] for own in values.reshape(-1, *measured.shape)]
+            seen = measured(twin, episode)
+            means = [binned_residuals(seen - own, self.settings.bins)[0] for own in values.reshape(-1, *seen.shape)]
             out.append(np.stack(means).reshape(*several, *means[0].shape))
         return np.nan_to_num(np.concatenate(out, axis=len(several)), nan=0.0)
 
     @cached_property
     def data(self) -> _Data:
-        if self.like:
-            return self.like.data
         twin = self.posterior.twin
-        counts = np.concatenate([binned_residuals(twin.measured(e))[1] for e in self.episodes])
-        at = np.concatenate([self._at(episode) for episode in self.episodes])
+        counts = np.concatenate([binned_residuals(measured(twin, e), self.settings.bins)[1] for e in self.episodes])
+        at = np.concatenate([self.at(episode) for episode in self.episodes])
         noise = np.array(list(twin.noise_sd.values()))
         return _Data(self.lookup_table.unit(at), self.lookup_table.weights(at), noise**2 / np.maximum(counts, 1e-9))
 
@@ -194,31 +146,23 @@ class Discrepancy:
 
     @cached_property
     def fitted(self) -> tuple[_Fitted, ...]:
-        if self.like:
-            return self.like.fitted
         left, data = self._residuals(self.posterior.mode), self.data
         on = np.array([np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd])[:, None]
-        return _fit(data.at * on, left.T, data.variance.T, self.lookup_table.nodes * on)
+        return _fit(data.at * on, left.T, data.variance.T, self.lookup_table.nodes * on, self.settings)
 
     @cached_property
-    def _floors(self) -> tuple[NDArray[np.float64], ...]:
-        """By output, how far off it may be at each node however well the model fits elsewhere; without the scale."""
+    def _priors(self) -> tuple[NDArray[np.float64], ...]:
+        """Covariance of each output at the nodes with the scale 1."""
         twin, nodes, inputs = self.posterior.twin, self.lookup_table.nodes, self._inputs
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(self.lookup_table.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
         flowing = np.maximum(sizes[:, inputs].max(axis=1), twin.floor_at_zero_input) ** 0.5 if inputs.any() else np.ones(len(nodes))
-        return tuple(
-            twin.discrepancy_sd_floor.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing) for name in twin.noise_sd
-        )
-
-    @cached_property
-    def _parts(self) -> tuple[_Part, ...]:
-        parts = []
-        for i, (one, floor) in enumerate(zip(self.fitted, self._floors, strict=True)):
+        out = []
+        for name, one in zip(twin.noise_sd, self.fitted, strict=True):
             # One trajectory that the model fits says little of others.
-            prior = one.kernel * (one.variance + self.scale**2 * np.outer(floor, floor))
-            parts.append(_part(prior, self.data.variance[:, i], self.data.weights))
-        return tuple(parts)
+            floor = twin.discrepancy_sd_floor.get(name, 0.0) * (np.ones(len(nodes)) if self._inert(name) else flowing)
+            out.append(one.kernel * (one.variance + np.outer(floor, floor)))
+        return tuple(out)
 
 
 @dataclass(frozen=True)
@@ -240,21 +184,6 @@ class DiscrepancySample:
             out[:, columns] += np.sum(self.table[:, nodes] * shares, axis=-1).T
             changed.append(out)
         return replace(episode, output_start=changed[0], output_end=changed[1])
-
-
-class _Off(NamedTuple):
-    """A prediction beside what was measured, by stretch and output, shape (stretches, outputs)."""
-
-    square: NDArray[np.float64]
-    """Squared error."""
-    unmodelled: NDArray[np.float64]
-    """Its variance by the discrepancy with each of `SCALES`, which are a first axis."""
-    novel: NDArray[np.float64]
-    """With the scale 1, the share that this is of what it was before any trial."""
-    rest: NDArray[np.float64]
-    """Variance by unknowns and noise."""
-    known: NDArray[np.bool_]
-    """Whether it was measured."""
 
 
 class _Data(NamedTuple):
@@ -283,15 +212,24 @@ class _Part:
     gain: NDArray[np.float64]
     prior: NDArray[np.float64]
     cross: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    weights: NDArray[np.float64]
 
-    def variance(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """With ``weights`` of the nodes (K, nodes), shape (K,)."""
-        taken = np.sum((weights @ self.gain) * (weights @ self.cross.T), axis=1)
-        return np.asarray(np.maximum(self.variance_before(weights) - taken, 0.0))
-
-    def variance_before(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same before anything was measured."""
+    def prior_variance(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Before anything was measured, with ``weights`` of the nodes (K, nodes), shape (K,)."""
         return np.asarray(np.sum((weights @ self.prior) * weights, axis=1))
+
+    def variances(self, weights: NDArray[np.float64], scales: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance of the process that is so many times as large, given the data, with ``weights`` (K, nodes); shape (scales, K).
+
+        With W the noise of the data and W^-1/2 K W^-1/2 = U diag(a) U' it is s^2 k - s^4 |diag(s^2 a + 1)^-1/2 U' W^-1/2 c|^2.
+        """
+        white = 1.0 / np.sqrt(self.noise)
+        values, vectors = np.linalg.eigh(white[:, None] * (self.cross @ self.weights.T) * white)
+        across = (vectors.T @ (white[:, None] * (self.cross @ weights.T))) ** 2
+        square = scales[:, None] ** 2
+        taken = square**2 * (1.0 / (square * np.maximum(values, 0.0) + 1.0)) @ across
+        return np.asarray(np.maximum(square * self.prior_variance(weights) - taken, 0.0))
 
     @cached_property
     def root(self) -> NDArray[np.float64]:
@@ -307,7 +245,11 @@ class _Part:
 
 
 def _fit(
-    x: NDArray[np.float64], left: NDArray[np.float64], variance: NDArray[np.float64], nodes: NDArray[np.float64]
+    x: NDArray[np.float64],
+    left: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    settings: TwinSettings,
 ) -> tuple[_Fitted, ...]:
     """One process an output, all at once: x (outputs, n, d), residuals and their variance by noise (outputs, n), nodes (outputs, K, d).
 
@@ -318,11 +260,11 @@ def _fit(
     sizes = np.where(sizes > 0, sizes, 1.0)[:, None]
     count, _, d = x.shape
     batch = torch.Size([count])
-    medians = np.array(LENGTH[:d])
+    medians = np.array(settings.length_scales[:d])
 
     def fresh() -> SingleTaskGP:
         # In units of their prior medians all length scales have the same prior.
-        kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, LENGTH_SD), batch_shape=batch)
+        kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, settings.length_scale_sd), batch_shape=batch)
         scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
         kernel.lengthscale, scaled.outputscale = 1.0, 1.0
         return SingleTaskGP(
@@ -333,16 +275,16 @@ def _fit(
         )  # fmt: skip
 
     with reproducible(0):
-        scaled: Any = fitted(fresh, f"the error of the twin in {x.shape[1]} stretches", attempts=ATTEMPTS).covar_module
+        scaled: Any = fitted(fresh, f"the discrepancy of the twin in {x.shape[1]} bins", attempts=ATTEMPTS).covar_module
         with torch.no_grad():
             kernels, scales = scaled.base_kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
     return tuple(_Fitted(k, float(size**2 * scale)) for k, size, scale in zip(kernels, sizes[:, 0], scales, strict=True))
 
 
 def _part(prior: NDArray[np.float64], variance: NDArray[np.float64], weights: NDArray[np.float64]) -> _Part:
-    cross = weights @ prior
-    seen = cho_factor(cross @ weights.T + np.diag(variance + JITTER * prior[0, 0]), lower=True)
-    return _Part(cho_solve(seen, cross).T, prior, cross)
+    cross, noise = weights @ prior, variance + JITTER * prior[0, 0]
+    seen = cho_factor(cross @ weights.T + np.diag(noise), lower=True)
+    return _Part(cho_solve(seen, cross).T, prior, cross, noise, weights)
 
 
 def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

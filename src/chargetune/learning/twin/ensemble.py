@@ -1,10 +1,9 @@
-"""What the trials so far say of the plant, as plants that it could be."""
+"""The ensemble: plants that the trials so far allow, and what they do with a theta."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,124 +14,96 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import Simulate, windows_of
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin.calibration import SCALES, calibrate_scale
+from chargetune.learning.twin.calibration import SCALES, PredictionCheck, calibrate_scales, check_prediction
 from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
-from chargetune.learning.twin.posterior import Posterior
+from chargetune.learning.twin.laplace import fit
+from chargetune.learning.twin.rollout import predict_each
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.learning.twin.twin_loop import TwinLoop
-from chargetune.runtime.threads import submit
+from chargetune.runtime.cache import Built
 
 __all__ = ["Ensemble", "Prediction", "condition", "episodes_of"]
 
-# Traces beyond the newest ones add time and hardly information: each holds some hundred samples.
-TRACES_MAX = 4
-# Times more wrong than allowed for, at which a twin is none.
-MISTAKEN = 3.5
+# Of several studies in one process; what was learnt from a trace is used again after the next one.
+_LEARNT: Built = Built(8, casadi=False)
+_CHECKED: Built = Built(256, casadi=False)
 
 
 @dataclass(frozen=True)
 class Ensemble:
     """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
 
-    ``standardised_error``: how wrong those before it were about the newest trial (`Discrepancy.predicted_before`); 0 before two are known.
+    ``checks`` say how well each trace but the first was predicted by those before it.
     """
 
     loop: TwinLoop
-    posterior: Posterior
+    settings: TwinSettings
     discrepancy: Discrepancy | None
-    standardised_error: float = 0.0
+    checks: tuple[PredictionCheck, ...] = ()
 
     @property
-    def predicted_before(self) -> int:
-        """How many of the traces learnt from were predicted_before by those before them."""
-        return len(self.discrepancy.episodes) - 1 if self.discrepancy else 0
-
-    @property
-    def proved(self) -> bool:
-        """Whether there is a trial that those before it predicted_before."""
-        return self.predicted_before > 0
-
-    @property
-    def mistaken(self) -> bool:
-        """Whether the newest trial was so far from what two or more before it predicted_before that the twin is none."""
-        return self.predicted_before > 1 and self.standardised_error >= MISTAKEN
-
-    @property
-    def beyond_scale(self) -> bool:
-        """Whether its errors may be larger than any scale that is told apart."""
-        return self.discrepancy is not None and self.discrepancy.scale >= SCALES[-1]
+    def is_none(self) -> str:
+        """Why the twin is no twin of this plant; empty while it may be one."""
+        # A single prediction rests on one trace, which may be far from where the next one went.
+        error = self.checks[-1].standardised_error if len(self.checks) > 1 else 0.0
+        if error >= self.settings.standardised_error_max:
+            return f"the newest trial was {error:.1f} stated standard deviations from its prediction"
+        scales = calibrate_scales(self.checks, self.settings.scale_sd, 1)
+        return f"its errors are more than {SCALES[-2]:.1f} times as large as stated" if scales[0] >= SCALES[-2] else ""
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
-        if theta.tobytes() not in self._expected:
-            (self._expected[theta.tobytes()],) = self.expected([theta])
-        return self._expected[theta.tobytes()]
+        return self.expected([theta])[0]
 
     def expected(self, thetas: Sequence[NDArray[np.float64]]) -> list[Episode | None]:
         """`central` of several thetas."""
         return self.loop.simulate([(theta, *self._centre) for theta in thetas])
 
-    def scores(self, thetas: Sequence[NDArray[np.float64]]) -> list[Score | None]:
-        """Verdicts on the episodes expected of several thetas; None where there is no episode or it has none."""
-        fresh = [theta for theta in thetas if theta.tobytes() not in self._scored]
-        for theta, episode in zip(fresh, self.expected(fresh) if fresh else [], strict=True):
-            self._scored[theta.tobytes()] = None if episode is None else self.loop.score(episode)
-        return [self._scored[theta.tobytes()] for theta in thetas]
-
     def plant(self, seed: int) -> Simulate:
         """One plant drawn from the ensemble: thetas -> episodes."""
-        ((m, error),) = self._plants(1, seed)
+        ((m, error),) = self._members(1, seed)
         return lambda thetas: self.loop.simulate([(theta, m, error) for theta in thetas])
 
-    def predict(self, theta: NDArray[np.float64], count: int, seed: int) -> Prediction:
-        """What ``count`` plants drawn from the ensemble do; the same plants for the same seed."""
-        return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in self._plants(count, seed)])))
+    def predict(self, theta: NDArray[np.float64], seed: int, count: int | None = None) -> Prediction:
+        """What ``count`` members do with theta, as many as the settings say; the same plants for the same count and seed."""
+        members = self._members(count or self.settings.plants, seed)
+        return Prediction(self.loop, tuple(self.loop.simulate([(theta, *plant) for plant in members])), self.settings.near)
 
-    def replayed(self, episode: Episode, count: int, seed: int) -> Prediction:
-        """What ``count`` drawn plants do under the recorded inputs of an episode, without noise.
+    def replayed(self, episode: Episode, seed: int) -> Prediction:
+        """What the members do under the recorded inputs of an episode, without noise.
 
         Of an episode that was learnt from it is what truly happened there, closer than `predict` has it: no controller acts differently
         on each plant. With noise added it is what the next episode with these inputs should measure: a posterior predictive check.
         """
         twin, out = self.loop.twin, []
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
-        plants = self._plants(count, seed)
-        (predicted,) = twin.predict_each(np.array([m for m, _ in plants]), [episode.input])
-        for values, (_, error) in zip(predicted, plants, strict=True):
+        members = self._members(self.settings.plants, seed)
+        (predicted,) = predict_each(twin, np.array([m for m, _ in members]), [episode.input])
+        for values, (_, error) in zip(predicted, members, strict=True):
             own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
             own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
             out.append(error(own) if error else own)
-        return Prediction(self.loop, tuple(out))
+        return Prediction(self.loop, tuple(out), self.settings.near)
 
     @cached_property
     def _centre(self) -> tuple[NDArray[np.float64], DiscrepancySample | None]:
-        mode = self.posterior.mode
-        return mode, self.discrepancy.error(mode) if self.discrepancy else None
+        if self.discrepancy is None:
+            return fit(self.loop.twin, (), self.settings).mode, None
+        mode = self.discrepancy.posterior.mode
+        return mode, self.discrepancy.mean(mode)
 
-    def draw(self, count: int, seed: int) -> None:
-        """Begins to draw the plants of `predict` with this count and seed, while something else goes on."""
+    def _members(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
+        """Unknowns and discrepancy of so many plants; each has its own scale of the discrepancy."""
         if (count, seed) not in self._drawn:
-            self._begun[count, seed] = submit(self.posterior.draw, count, seed)
-
-    def _plants(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
-        if (count, seed) not in self._drawn:
-            begun = self._begun.pop((count, seed), None)
-            draws = begun.result() if begun else self.posterior.draw(count, seed)
-            seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
-            errors = self.discrepancy.errors(draws, seeds) if self.discrepancy else [None] * count
+            posterior = self.discrepancy.posterior if self.discrepancy else fit(self.loop.twin, (), self.settings)
+            draws = posterior.draw(count, seed)
+            errors: Sequence[DiscrepancySample | None] = [None] * count
+            if self.discrepancy:
+                seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
+                levels = calibrate_scales(self.checks, self.settings.scale_sd, min(count, self.settings.scales))
+                errors = self.discrepancy.samples(draws, [levels[k % len(levels)] for k in range(count)], seeds)
             self._drawn[count, seed] = list(zip(draws, errors, strict=True))
         return self._drawn[count, seed]
-
-    @cached_property
-    def _expected(self) -> dict[bytes, Episode | None]:
-        return {}
-
-    @cached_property
-    def _scored(self) -> dict[bytes, Score | None]:
-        return {}
-
-    @cached_property
-    def _begun(self) -> dict[tuple[int, int], Future[NDArray[np.float64]]]:
-        return {}
 
     @cached_property
     def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], DiscrepancySample | None]]]:
@@ -141,10 +112,11 @@ class Ensemble:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Episodes with one theta over an ensemble of plants; None where one failed."""
+    """Episodes with one theta over the members of an ensemble; None where one failed."""
 
     loop: TwinLoop
     episodes: tuple[Episode | None, ...]
+    near: float
 
     @cached_property
     def scores(self) -> list[Score]:
@@ -155,31 +127,35 @@ class Prediction:
     @cached_property
     def excess(self) -> NDArray[np.float64]:
         """Excess less tolerance by plant and window, in tolerances, shape (plants, windows); nan where none was visited."""
-        rows = [windows_of(score) for score in self.scores]
-        return np.array(rows) if rows else np.empty((0, 0))
+        return np.array([windows_of(score) for score in self.scores]) if self.scores else np.empty((0, 0))
 
     def probability(self) -> float:
         """Share of the plants that keep every limit within its tolerance."""
         kept = np.all(~(self.excess > 0), axis=1)
         return float(np.sum(kept) / len(self.episodes))
 
-    def upper_rows(self, deviations: float) -> NDArray[np.float64] | None:
-        """mean + ``deviations`` sd of the measured rows (`ClosedLoop`) at each sample, shape (K, 2, rows); None where all failed."""
-        rows = [self.loop.measured_rows(e) for e in self.episodes if e is not None]
-        if not rows:
-            return None
-        longest = max(len(r) for r in rows)
-        whole = np.array([r for r in rows if len(r) == longest])
-        return np.asarray(whole.mean(axis=0) + deviations * whole.std(axis=0))
+    def objective(self) -> float:
+        """Mean over the plants; -inf where none has a score."""
+        return float(np.mean([s.objective for s in self.scores])) if self.scores else -np.inf
 
-    def upper_windows(self, deviations: float) -> NDArray[np.float64]:
-        """mean + ``deviations`` sd of the excess by window; nan where hardly a plant was."""
+    def upper_windows(self, probability: float) -> NDArray[np.float64]:
+        """Upper bounds of the excess by window that hold together on this share of the plants; nan where hardly one of them was.
+
+            e_w <= mean_w + k sd_w for every window w,  k the quantile over plants j of max_w (e_jw - mean_w) / sd_w
+
+        over the windows that are at most ``near`` sd below their limit.
+        """
         known = np.isfinite(self.excess)
         count = known.sum(axis=0)
         values = np.where(known, self.excess, 0.0)
         mean = values.sum(axis=0) / np.maximum(count, 1)
-        sd = np.sqrt(np.where(known, (values - mean) ** 2, 0.0).sum(axis=0) / np.maximum(count, 1))
-        return np.where(2 * count > len(self.excess), mean + deviations * sd, np.nan)
+        off = np.where(known, values - mean, 0.0)
+        sd = np.sqrt((off**2).sum(axis=0) / np.maximum(count, 1))
+        counts = (mean + self.near * sd > 0) & (2 * count > len(self.excess))
+        standardised = np.divide(off, sd, out=np.zeros_like(off), where=(sd > 0) & counts)
+        largest = standardised.max(axis=1, initial=0.0)
+        k = float(np.quantile(largest, probability)) if largest.size else 0.0
+        return np.where(2 * count > len(self.excess), mean + k * sd, np.nan)
 
 
 def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
@@ -188,44 +164,37 @@ def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
     return [e for reader in readers if (e := reader()) is not None and len(e)]
 
 
-def condition(loop: TwinLoop, trials: Sequence[TrialLike], sure: float = 0.5, unproved: float | None = None) -> Ensemble:
-    """What the traces of these trials say; the prior when there is none.
-
-    ``sure``: the probability that the twin's errors are at most as large as believed, as far as the trials tell: how well each was
-    predicted_before by those before it is how far their successor can be trusted. ``unproved``: the same before one was predicted_before, else ``sure``.
-    """
-    twin, every = loop.twin, episodes_of(trials)
+def condition(loop: TwinLoop, trials: Sequence[TrialLike], settings: TwinSettings | None = None) -> Ensemble:
+    """What the traces of these trials leave of the plants; the prior where there is none."""
+    settings, every = settings or TwinSettings(), episodes_of(trials)
     if not every:
-        return Ensemble(loop, twin.fit(()), None)
-    keys = _keys(every)
-    for k in range(1, len(every)):
-        # What was once judged stays so.
-        if keys[k] not in twin.predicted_before:
-            twin.predicted_before[keys[k]] = _learnt(loop, every[:k], keys[:k]).predicted_before(every[k])
-    predicted_before = [twin.predicted_before[key] for key in keys[1:]]
-    learnt = _learnt(loop, every, keys).scaled(
-        calibrate_scale(predicted_before, sure if predicted_before or unproved is None else unproved)
-    )
-    return Ensemble(loop, learnt.posterior, learnt, predicted_before[-1].standardised_error if predicted_before else 0.0)
+        return Ensemble(loop, settings, None)
+    keys = _keys(loop, settings, every)
+
+    def check(k: int) -> PredictionCheck:
+        return _CHECKED.get(keys[k], lambda: check_prediction(_learnt(loop, settings, every[:k], keys[:k]), every[k]))
+
+    checks = tuple(check(k) for k in range(1, len(every)))
+    return Ensemble(loop, settings, _learnt(loop, settings, every, keys), checks)
 
 
-def _learnt(loop: TwinLoop, episodes: Sequence[Episode], keys: Sequence[bytes]) -> Discrepancy:
-    """Of the newest of these episodes, with the scale 1. What was learnt last is remembered: it is to foretell what comes next."""
-    twin = loop.twin
-    if keys[-1] not in twin.newest:
-        newest = tuple(episodes[-TRACES_MAX:])
-        posterior = twin.fit(newest, way=twin.ways[keys[-2]] if len(keys) > 1 else ())
-        twin.ways[keys[-1]] = posterior.way
-        twin.newest.clear()
-        twin.newest[keys[-1]] = Discrepancy(posterior, newest, loop.features)
-    return twin.newest[keys[-1]]
+def _learnt(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode], keys: Sequence[str]) -> Discrepancy:
+    """Of the newest of these episodes; the fit begins where that of all but the last one ended."""
+
+    def build() -> Discrepancy:
+        newest = tuple(episodes[-settings.traces :])
+        before = _learnt(loop, settings, episodes[:-1], keys[:-1]).posterior if len(episodes) > 1 else None
+        return Discrepancy(fit(loop.twin, newest, settings, start=before), newest, loop.features, settings)
+
+    return _LEARNT.get(keys[-1], build)
 
 
-def _keys(episodes: Sequence[Episode]) -> list[bytes]:
-    """Of each of these episodes what it and all before it contain."""
-    digest, out = hashlib.blake2b(), []
+def _keys(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode]) -> list[str]:
+    """Of each of these episodes what it, all before it, the twin and the settings contain."""
+    digest = hashlib.blake2b(repr((loop.twin.content, dict(loop.features), settings)).encode(), digest_size=16)
+    out = []
     for one in episodes:
         for part in (one.input, one.output_start, one.output_end):
             digest.update(part.tobytes())
-        out.append(digest.digest())
+        out.append(digest.hexdigest())
     return out

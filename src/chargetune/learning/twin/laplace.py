@@ -1,19 +1,93 @@
-"""How far a twin is from what was measured, for a least-squares search of its unknowns."""
+"""The posterior of a twin's unknowns by Laplace's approximation.
+
+Model: y = h(x, u, p) + bias + discrepancy, x+ = f(x, u, p), p = nominal * exp(m) for factors and nominal + m for offsets, with
+prior m ~ N(0, S). Every measured output at both ends of every interval of every trial is a datum. The mode is found by Gauss-Newton
+with exact sensitivities, the covariance is (J'J)^-1 of the whitened residuals there. Where that is not the posterior's shape along an
+unknown that is one number, it is a sum of such Gaussians (`nested_laplace`).
+Source: MacKay, Neural Computation 4 (1992) 448; Bock, in Modelling of Chemical Reaction Systems (1981) for the least squares.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
+from chargetune.episode.episode import Episode
+from chargetune.learning.twin.nested_laplace import nested_laplace
+from chargetune.learning.twin.posterior import Posterior
+from chargetune.learning.twin.residuals import binned_residuals, measured
+from chargetune.learning.twin.rollout import predict, predict_each, slopes
+from chargetune.learning.twin.settings import TwinSettings
+from chargetune.learning.twin.twin import Twin
 from chargetune.runtime.threads import parallel_map
 
-if TYPE_CHECKING:
-    from chargetune.learning.twin.twin import Twin
+__all__ = ["NegativeLogPosterior", "fit"]
 
-__all__ = ["NegativeLogPosterior"]
+# Tolerances of the least squares: a change of the loss, or of the unknowns, by less is not worth another evaluation.
+FTOL, XTOL, EVALUATIONS = 1e-6, 1e-5, 30
+# Relative change of the sd of a sample after which no other fit is worth it.
+SAME = 0.02
+
+
+def fit(
+    twin: Twin,
+    episodes: Sequence[Episode],
+    settings: TwinSettings | None = None,
+    *,
+    discrepancy: bool = True,
+    start: Posterior | None = None,
+) -> Posterior:
+    """The posterior from the measured outputs of these episodes; samples that are not finite are left out.
+
+    With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with the variance that
+    this adds. Where the means of whole bins are not zero, neighbouring residuals have one cause, and all samples of as many bins as
+    are correlated count as one. ``start`` is the posterior of most of these episodes, from which the search begins. Without episodes
+    the result is the prior.
+    """
+    settings, factor = settings or TwinSettings(), twin.prior_factor
+    data = [(e.input, measured(twin, e)) for e in episodes if len(e)]
+    noise = np.array(list(twin.noise_sd.values()))
+    warm = start is not None and bool(data) and discrepancy
+    e = np.asarray(np.linalg.solve(factor, start.mode) if warm and start else np.zeros(len(factor)), dtype=np.float64)
+    spread = start.spread if warm and start else noise
+    unmodelled = np.zeros(len(noise))
+    for k in range(1 + settings.refits):
+        loss = NegativeLogPosterior(twin, data, spread)
+        found = least_squares(loss.values, e, jac=loss.slopes, method="trf", x_scale=1.0, max_nfev=EVALUATIONS, ftol=FTOL, xtol=XTOL)
+        e = np.asarray(found.x, dtype=np.float64)
+        if not (data and discrepancy):
+            break
+        predicted = predict_each(twin, factor @ e, [u for u, _ in data])
+        residuals = [y - own for (_, y), own in zip(data, predicted, strict=True)]
+        unmodelled, following = _unmodelled(residuals, noise, settings)
+        # Mode, covariance and the sd of a sample belong to one fit.
+        if k == settings.refits or np.allclose(following, spread, rtol=SAME):
+            break
+        spread = following
+    # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.
+    curvature, directions = np.linalg.eigh(found.jac.T @ found.jac)
+    root = np.asarray(directions / np.sqrt(curvature), dtype=np.float64)
+    parts = nested_laplace(loss, e, root, twin.scalars) if data else []
+    components = tuple((one.share, Posterior(twin, factor @ one.mode, factor @ one.root, unmodelled, spread)) for one in parts)
+    return Posterior(twin, factor @ e, factor @ root, unmodelled, spread, components)
+
+
+def _unmodelled(
+    left: list[NDArray[np.float64]], noise: NDArray[np.float64], settings: TwinSettings
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """From residuals: (standard deviation of what the model cannot represent, that of a sample as the likelihood takes it)."""
+    means, counts = (np.concatenate(parts) for parts in zip(*(binned_residuals(r, settings.bins) for r in left), strict=True))
+    known = counts > 0
+    size = np.maximum(known.sum(axis=0), 1)
+    block = np.where(known, means, 0.0) ** 2 - np.where(known, noise**2 / np.maximum(counts, 1.0), 0.0)
+    slow = np.maximum(block.sum(axis=0) / size, 0.0)
+    square = np.concatenate([r.reshape(-1, len(noise)) for r in left]) ** 2
+    whole = np.maximum(np.nanmean(np.where(np.isfinite(square).any(axis=0), square, 0.0), axis=0) - noise**2, slow)
+    samples = counts.sum(axis=0) / size
+    return np.sqrt(whole), np.sqrt(noise**2 + settings.correlated_bins * samples * slow + (whole - slow))
 
 
 class NegativeLogPosterior:
@@ -57,7 +131,7 @@ class NegativeLogPosterior:
         twin, d = self._twin, len(e)
         m = twin.prior_factor @ e
         both = np.empty((len(weight), d + 1))
-        both[:, :d], both[:, d] = twin.slopes(m, inputs).reshape(-1, d), twin.predict(m, inputs).ravel()
+        both[:, :d], both[:, d] = slopes(twin, m, inputs).reshape(-1, d), predict(twin, m, inputs).ravel()
         # What was not measured may be predicted to be no number.
         both[weight == 0.0] = 0.0
         both *= weight[:, None]

@@ -1,28 +1,24 @@
-"""Residuals of whole episodes, averaged over bins because neighbours have one cause."""
+"""What was measured of an episode, and residuals averaged over bins because neighbours have one cause."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    pass
+from chargetune.episode.episode import Episode
+from chargetune.learning.twin.twin import Twin
 
-__all__ = ["binned_residuals"]
-
-# Stretches of an episode over which residuals are averaged: what a model cannot represent changes slowly.
-BINS = 40
+__all__ = ["binned_residuals", "measured"]
 
 
-# Neighbouring stretches that err together: so many count as one.
-CORRELATED_BINS = 4.0
+def measured(twin: Twin, episode: Episode) -> NDArray[np.float64]:
+    """The twin's measured outputs at both ends of every interval, shape (K, 2, number of measured outputs)."""
+    return np.stack([np.stack(episode.signal(name), axis=1) for name in twin.noise_sd], axis=2)
 
 
-def binned_residuals(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means over `BINS` stretches, of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= BINS, n)."""
-    parts = min(BINS, len(values))
+def binned_residuals(values: NDArray[np.float64], bins: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means over so many bins of values (K, 2, n) at both ends of intervals, and how many were finite; shapes (<= bins, n)."""
+    parts = min(bins, len(values))
     sizes = np.full(parts, len(values) // parts) + (np.arange(parts) < len(values) % parts)
     starts = np.cumsum(sizes) - sizes
     seen = np.isfinite(values)

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.learning.twin.twin import Twin
 from chargetune.runtime.cache import built_once
 from chargetune.runtime.compiler import compile_library, find_compiler
 from chargetune.runtime.hoisting import hoist
 from chargetune.runtime.numpy_call import numpy_call
 from chargetune.runtime.split import split
+from chargetune.runtime.threads import parallel_map
 
-if TYPE_CHECKING:
-    pass
-from chargetune.learning.twin.twin import Twin, Uncertain
-
-__all__ = []
+__all__ = ["parameters", "predict", "predict_each", "slopes", "slopes_each", "start_state"]
 
 # Intervals of the shortest roll-out that is built; longer ones are this times a power of two.
 SHORTEST = 45
@@ -27,6 +27,51 @@ SHORTEST = 45
 
 # Unknowns that are simulated in one call: enough that nothing waits for the interpreter, few enough for every core to have some.
 AT_ONCE = 8
+
+
+def parameters(twin: Twin, m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The model's parameter vector p for unknowns m, shape (np,)."""
+    return np.array(_mapping(_Key(twin))[0](m, *_numbers(twin))).ravel()
+
+
+def start_state(twin: Twin, m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The state at the start of a trial for unknowns m, shape (nx,)."""
+    return np.array(_mapping(_Key(twin))[1](m, *_numbers(twin))).ravel()
+
+
+def predict(twin: Twin, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Measured outputs at both ends of every interval under ``inputs`` (K, nu), shape (K, 2, number of measured outputs)."""
+    return predict_each(twin, m, [inputs])[0]
+
+
+def predict_each(twin: Twin, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """`predict` under the inputs of each of several episodes, at once; for m of shape (n, d) each result is (n, K, 2, outputs)."""
+    return _roll(twin, 0, m, inputs, (2, len(twin.noise_sd)))
+
+
+def slopes(twin: Twin, m: NDArray[np.float64], inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Exact slopes of `predict` with respect to m, shape (K, 2, number of measured outputs, d)."""
+    return slopes_each(twin, m, [inputs])[0]
+
+
+def slopes_each(twin: Twin, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """`slopes` under the inputs of each of several episodes, at once."""
+    return _roll(twin, 1, m, inputs, (2, len(twin.noise_sd), sum(twin.sizes)))
+
+
+def _roll(
+    twin: Twin, which: int, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]], shape: tuple[int, ...]
+) -> list[NDArray[np.float64]]:
+    """What the function of that number says of each interval, in this shape, after the first axes of m."""
+    padded = np.zeros((len(inputs), _padded(max(len(u) for u in inputs)), len(twin.model.inputs)))
+    for row, u in zip(padded, inputs, strict=True):
+        row[: len(u)] = u
+    function = partial(_evaluated, _Key(twin), which, padded)
+    several, d = m.shape[:-1], m.shape[-1]
+    rows = m.reshape(-1, d)
+    parts = parallel_map(function, [rows[i : i + AT_ONCE] for i in range(0, len(rows), AT_ONCE)]) if len(rows) > 1 else [function(rows)]
+    out = np.concatenate(parts).reshape(len(rows), *padded.shape[:2], *shape)
+    return [out[:, k, : len(u)].reshape(*several, len(u), *shape) for k, u in enumerate(inputs)]
 
 
 class _Key:
@@ -51,18 +96,13 @@ def _numbers(twin: Twin) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return twin.model.nominal, np.array([float(twin.start.get(name, 0.0)) for name in twin.model.state_names])
 
 
-def _slot(one: Uncertain) -> tuple[str, str]:
-    """What an unknown belongs to: factor and offset of a block exclude each other."""
-    return one.name, one.kind if one.kind in ("start", "bias") else "block"
-
-
 def _symbols(twin: Twin) -> tuple[Any, Any, Any, Any, Any, Any]:
     """(m, nominal parameters, nominal start, p(m), x0(m), biases(m) by measured output) as expressions."""
     model = twin.model
     m = ca.SX.sym("m", sum(twin.sizes))
     nominal, begin = ca.SX.sym("nominal", model.nominal.size), ca.SX.sym("begin", len(model.states))
     pieces = split(m, twin.sizes)
-    parts = {_slot(one): piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
+    parts = {one.slot: piece for one, piece in zip(twin.unknowns, pieces, strict=True)}
     kinds = {one.name: one.kind for one in twin.unknowns if one.kind in ("factor", "offset")}
     blocks, first = [], 0
     for name, values in model.parameters:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
-from chargetune.episode.score import Score
-from chargetune.learning.closed_loop.loop import ClosedLoop
+from chargetune.learning.closed_loop.loop import JudgedLoop
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.twin import Twin
@@ -28,7 +27,7 @@ class TracedTrial(TrialLike, Protocol):
     def episode(self) -> Callable[[], Episode | None] | None: ...
 
 
-class TwinLoop(ClosedLoop, Protocol):
+class TwinLoop(JudgedLoop, Protocol):
     """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
 
     @property
@@ -36,19 +35,14 @@ class TwinLoop(ClosedLoop, Protocol):
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
-        """Signals of an episode, with their ranges, that the error of the twin depends on."""
+        """Signals of an episode, with their ranges, that the discrepancy of the twin depends on.
+
+        First the one along which it changes fastest.
+        """
         ...
 
-    def simulate(self, cases: Sequence[Member]) -> list[Episode | None]:
-        """A noise-free episode of each case, None where it fails; the third of a case is added to the measured outputs."""
-        ...
-
-    def score(self, episode: Episode) -> Score | None:
-        """The verdict on an episode; None when it has none."""
-        ...
-
-    def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
-        """By limit of the score the excess of every sample, in its unit, and the window of its profile that it counts in, 0 without one."""
+    def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
+        """A noise-free episode of each member, None where it fails; its discrepancy is added to the measured outputs."""
         ...
 
     def violation(self, episode: Episode) -> float:
