@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,12 +51,15 @@ class Proposal:
         return fresh.probability() >= self.probability
 
     def accepts(self, candidate: Candidate) -> bool:
+        """Whether it keeps every limit on the share of the ensemble that is asked for."""
         return candidate[1].probability() >= self.probability
 
-    def backtrack(self, safe: NDArray[np.float64], aim: NDArray[np.float64]) -> Candidate | None:
-        """The longest part of the way from an accepted theta to what is aimed at that is accepted; None where no part is."""
-        parts = (self.candidate(safe + share * (aim - safe)) for share in self.ensemble.settings.steps_back)
-        return next((part for part in parts if self.accepts(part)), None)
+    def backtrack(
+        self, safe: NDArray[np.float64], aim: NDArray[np.float64], passes: Callable[[NDArray[np.float64]], bool]
+    ) -> NDArray[np.float64] | None:
+        """The longest part of the way from a theta that passes to one that does not, and that passes; None where no part does."""
+        parts = (safe + share * (aim - safe) for share in self.ensemble.settings.steps_back)
+        return next((theta for theta in parts if passes(theta)), None)
 
     def search(self) -> tuple[list[Candidate], Candidate]:
         """(accepted candidates, the best first; the candidate found last).
@@ -87,8 +90,8 @@ class Proposal:
             margin = new if k == 0 else (margin + new) / 2
         ranked = [one for _, one in sorted(accepted, key=lambda one: -one[0])]
         if ranked and not self.accepts(candidate):
-            further = self.backtrack(ranked[0][0], candidate[0])
-            ranked = [further, *ranked] if further else ranked
+            further = self.backtrack(ranked[0][0], candidate[0], lambda theta: self.accepts(self.candidate(theta)))
+            ranked = ranked if further is None else [self.candidate(further), *ranked]
         return ranked, candidate
 
     @cached_property

@@ -42,8 +42,7 @@ def safe_thetas(proposal: Proposal, safety: Safety, count: int = 1) -> list[NDAr
         what = f"no theta keeps every limit with probability {safety.probability:g}"
         raise NoSafeThetaError(f"{what} as far as the {len(proposal.trials)} trials show; nothing was proposed")
     aim = (accepted[0] if accepted else last)[0]
-    parts = (tried + share * (aim - tried) for share in proposal.ensemble.settings.steps_back)
-    part = next((theta for theta in parts if proposal.holds(theta)), None)
+    part = proposal.backtrack(tried, aim, proposal.holds)
     if part is None:
         warnings.warn("no safe improvement is known: a theta that was tried is proposed again", RuntimeWarning, stacklevel=2)
     return [tried if part is None else part]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
 from chargetune.learning.candidates import Proposal
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.initial_design import initial_design
@@ -40,8 +41,8 @@ class TwinTuner:
     on the simulated closed loop with the twin at its posterior mode plus the mean discrepancy, with margins from an ensemble of plants
     that the traces allow (`Proposal`), such that every limit is kept on at least half of them. Further thetas of a batch, and those
     proposed beside running trials, are best on posterior draws. Deterministic: the same trials give the same thetas.
-    Without a single trace the design is Sobol's. Where the twin is no model of the plant, the best trial that kept its limits
-    is proposed again, with a warning.
+    Without a single trace the design is Sobol's. Where the twin is no model of the plant the black box `ConstrainedLogEI` proposes,
+    with a warning.
 
     With ``safety`` the share is the stated probability, fresh plants judge, and the first theta is the declared start, or the most
     cautious corner (`safe_thetas`). Where no theta is safe enough `NoSafeThetaError` is raised, and nothing reaches the plant. Further
@@ -82,11 +83,12 @@ class TwinTuner:
         if ensemble.discrepancy is None:
             return initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)[:n]
         proposal = Proposal(space, ensemble, trials, LIKELY, self._seed(trials))
-        if ensemble.is_none and proposal.kept:
+        if ensemble.is_none:
             warnings.warn(
-                f"the twin is no model of this plant: {ensemble.is_none}; the best trial is repeated", RuntimeWarning, stacklevel=2
+                f"the twin is no model of this plant: {ensemble.is_none}; this proposal is the black box's", RuntimeWarning, stacklevel=2
             )
-            return np.tile(proposal.kept[0], (n, 1))
+            # Without further Sobol points: the trials so far are its initial data.
+            return ConstrainedLogEI(self.seed, n_initial=0).ask(space, trials, n)
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
         thetas = [] if pending else [self._likely(proposal)]
