@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.initial_design import sobol_points
@@ -68,31 +69,41 @@ class Proposal:
 
             max objective  s.t.  excess <= tolerance - margin  on the expected plant,
 
-        with a proximal term around the best trial (`solve_slp`). The margin of a round is the difference between the upper bound over the
-        ensemble and the expected excess at the theta of the round before, by window; 0 in the first round. A margin falls with the
-        current that it leads to, so from the third round on it is the mean of the new one and the one before.
+        with a proximal term around the best trial (`solve_slp`). A margin is the difference between the upper bound over the ensemble and
+        the expected excess, by window, at one theta: in the first round at the best trial's, then the mean of the last margin and of that
+        at the theta found, because a margin grows with the current that it allows.
         """
-        settings, u = self.ensemble.settings, self._start
-        margin: NDArray[np.float64] | float = 0.0
+        settings, theta = self.ensemble.settings, self.space.from_unit(self._centre)
+        margin, _ = self._margin(self.candidate(theta))
         accepted: list[tuple[float, Candidate]] = []
-        for k in range(settings.rounds):
-            before = u
-            start = min((u, self._centre), key=lambda point: self.expected.merit(point, margin))
+        refused: list[tuple[float, Candidate]] = []
+        starts = [self._centre, self._start]
+        for _ in range(settings.rounds):
+            start = min(starts, key=lambda point: self.expected.merit(point, margin))
             u = self.expected.refine(start, settings.iterations, settings.gain, margin, settings.proximal, self._centre)
-            candidate, score = self.candidate(self.space.from_unit(u)), self.expected.score(u)
+            candidate = self.candidate(self.space.from_unit(u))
+            new, score = self._margin(candidate)
             if score is None:
                 break
-            if self.accepts(candidate):
-                accepted.append((score.objective, candidate))
-            if k and np.max(np.abs(u - before)) < settings.settled:
-                break
-            new = np.maximum(np.nan_to_num(candidate[1].upper_windows((1 + self.probability) / 2) - windows_of(score)), 0.0)
-            margin = new if k == 0 else (margin + new) / 2
+            (accepted if self.accepts(candidate) else refused).append((score.objective, candidate))
+            margin = (margin + new) / 2
+            starts.append(u)
         ranked = [one for _, one in sorted(accepted, key=lambda one: -one[0])]
-        if ranked and not self.accepts(candidate):
-            further = self.backtrack(ranked[0][0], candidate[0], lambda theta: self.accepts(self.candidate(theta)))
-            ranked = ranked if further is None else [self.candidate(further), *ranked]
-        return ranked, candidate
+        if not ranked:
+            return [], candidate
+        # Of what promises more the likeliest, and the longest part of the way there.
+        ahead = [one for objective, one in refused if objective > max(value for value, _ in accepted)]
+        aim = max(ahead, key=lambda one: one[1].probability(), default=ranked[0])
+        further = self.backtrack(ranked[0][0], aim[0], lambda theta: self.accepts(self.candidate(theta))) if ahead else None
+        return ranked if further is None else [self.candidate(further), *ranked], candidate
+
+    def _margin(self, candidate: Candidate) -> tuple[NDArray[np.float64] | float, Score | None]:
+        """By window, in tolerances, and the verdict on the expected plant; half of what is not promised is kept back."""
+        score = self.expected.score(self.space.to_unit(candidate[0]))
+        if score is None:
+            return 0.0, None
+        upper = candidate[1].upper_windows((1 + self.probability) / 2)
+        return np.maximum(np.nan_to_num(upper - windows_of(score)), 0.0), score
 
     @cached_property
     def expected(self) -> Search:

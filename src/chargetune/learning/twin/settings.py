@@ -36,8 +36,8 @@ class TwinSettings:
         A window that so many sd keep below its limit does not count among those that hold together.
     aim
         Share of a limit's tolerance that the upper side of the prediction may use; the rest is for what few plants do not show.
-    rounds, settled
-        Times that margins are taken from the theta found last, and the change, as a share of the range, that needs no other.
+    rounds
+        Times that the program is solved, each with margins from the theta found before. Each halves what the first margin is wrong by.
     iterations, gain
         Of the search in one round, and the share of the objective that an iteration has to win. A measured time is worth no more.
     proximal
@@ -62,7 +62,6 @@ class TwinSettings:
     near: float = 3.0
     aim: float = 0.75
     rounds: int = 6
-    settled: float = 5e-3
     iterations: int = 15
     gain: float = 1e-3
     proximal: float = 1e-3
@@ -74,7 +73,7 @@ class TwinSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is an integer >= 1")
-        for name in ("correlated_bins", "length_scale_sd", "scale_sd", "standardised_error_max", "near", "settled", "gain"):
+        for name in ("correlated_bins", "length_scale_sd", "scale_sd", "standardised_error_max", "near", "gain"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is a number > 0")
