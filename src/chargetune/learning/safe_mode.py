@@ -31,7 +31,7 @@ def safe_thetas(proposal: Proposal, safety: Safety, count: int = 1) -> list[NDAr
     if proposal.ensemble.discrepancy is None:
         return [_start(proposal, safety)]
     _check_budget(proposal, safety)
-    if proposal.ensemble.is_none:
+    if proposal.ensemble.rejected:
         return [_repeated(proposal)]
     accepted, last = proposal.search()
     safe = list(islice((theta for theta, _ in accepted if proposal.holds(theta)), count))
@@ -50,7 +50,7 @@ def safe_thetas(proposal: Proposal, safety: Safety, count: int = 1) -> list[NDAr
 
 def _repeated(proposal: Proposal) -> NDArray[np.float64]:
     """The best theta that kept every limit as measured: a twin that was wrong says nothing of another one."""
-    what = f"the twin is no model of this plant: {proposal.ensemble.is_none}"
+    what = f"the twin is no model of this plant: {proposal.ensemble.rejected}"
     if not proposal.kept:
         raise NoSafeThetaError(f"{what}, and no trial kept every limit; nothing was proposed")
     warnings.warn(f"{what}; the best theta that kept every limit is proposed again", RuntimeWarning, stacklevel=2)

@@ -83,9 +83,9 @@ class TwinTuner:
         if ensemble.discrepancy is None:
             return initial_design(space, max(n, len(trials) + n), self.seed, len(trials), n)[:n]
         proposal = Proposal(space, ensemble, trials, LIKELY, self._seed(trials))
-        if ensemble.is_none:
+        if ensemble.rejected:
             warnings.warn(
-                f"the twin is no model of this plant: {ensemble.is_none}; this proposal is the black box's", RuntimeWarning, stacklevel=2
+                f"the twin is no model of this plant: {ensemble.rejected}; this proposal is the black box's", RuntimeWarning, stacklevel=2
             )
             # Without further Sobol points: the trials so far are its initial data.
             return ConstrainedLogEI(self.seed, n_initial=0).ask(space, trials, n)

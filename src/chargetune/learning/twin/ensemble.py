@@ -42,8 +42,8 @@ class Ensemble:
     checks: tuple[PredictionCheck, ...] = ()
 
     @property
-    def is_none(self) -> str:
-        """Why the twin is no twin of this plant; empty while it may be one."""
+    def rejected(self) -> str:
+        """Why the twin is rejected as a model of this plant; empty while it may be one."""
         # A single prediction rests on one trace, which may be far from where the next one went.
         error = self.checks[-1].standardised_error if len(self.checks) > 1 else 0.0
         if error >= self.settings.standardised_error_max:
