@@ -26,7 +26,7 @@ from chargetune.runtime.split import split
 
 __all__ = ["KKT_TOLERANCE", "SolveStatus", "cold", "solver"]
 
-# Of the scaled problem, where 1 is the whole range of an input or one `scale` of a limit: 1e-4 of 6 A is 0.6 mA.
+# Tolerance of the scaled problem, where 1 is the whole range of an input or one `scale` of a limit: 1e-4 of 6 A is 0.6 mA.
 KKT_TOLERANCE = 1e-4
 HALVINGS_MAX = 6
 # Iterations from this one on take the curvature of constraints and dynamics into account. Gauss-Newton steps are cheaper and

@@ -43,7 +43,7 @@ class Score:
 
     @property
     def beyond(self) -> dict[str, float]:
-        """Of each limit the excess less its tolerance, in tolerances, so that limits of different units can be compared."""
+        """Excess less tolerance of each limit, in tolerances, so that limits of different units can be compared."""
         return {name: float(in_tolerances(value, self.tolerance.get(name, 0.0))) for name, value in self.excess.items()}
 
     @property

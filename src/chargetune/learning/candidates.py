@@ -91,7 +91,7 @@ class Proposal:
         ranked = [one for _, one in sorted(accepted, key=lambda one: -one[0])]
         if not ranked:
             return [], candidate
-        # Of what promises more the likeliest, and the longest part of the way there.
+        # A refused candidate may promise more: go as far towards the most probable of them as is accepted.
         ahead = [one for objective, one in refused if objective > max(value for value, _ in accepted)]
         aim = max(ahead, key=lambda one: one[1].probability(), default=ranked[0])
         further = self.backtrack(ranked[0][0], aim[0], lambda theta: self.accepts(self.candidate(theta))) if ahead else None

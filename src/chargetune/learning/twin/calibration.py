@@ -24,7 +24,7 @@ class PredictionCheck(NamedTuple):
     """What the prediction of one episode says."""
 
     log_likelihood: NDArray[np.float64]
-    """Of each of `SCALES`."""
+    """Log likelihood of each of `SCALES`."""
     standardised_error: float
     """Root mean square error over the sd of noise, unknowns and ``Twin.discrepancy_sd_floor``; several say that the twin is none."""
 

@@ -93,7 +93,7 @@ class Discrepancy:
         return LookupTable.over(self.features, list(self.posterior.twin.noise_sd))
 
     def at(self, episode: Episode) -> NDArray[np.float64]:
-        """Mean features of every stretch, shape (stretches, features)."""
+        """Mean features of every bin, shape (bins, features)."""
         return binned_residuals(self.signals(episode), self.settings.bins)[0]
 
     def signals(self, episode: Episode) -> NDArray[np.float64]:
@@ -117,7 +117,7 @@ class Discrepancy:
         return out
 
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean residual of every stretch, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
+        """Mean residual of every bin, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
         twin, several = self.posterior.twin, unknowns.shape[:-1]
         predicted = predict_each(twin, unknowns, [e.input for e in self.episodes])
         out = []
@@ -187,14 +187,14 @@ class DiscrepancySample:
 
 
 class _Data(NamedTuple):
-    """The stretches that are learnt from."""
+    """The bins that are learnt from."""
 
     at: NDArray[np.float64]
-    """Features as shares of their ranges, shape (stretches, features)."""
+    """Features as shares of their ranges, shape (bins, features)."""
     weights: NDArray[np.float64]
-    """Values at the nodes -> values there, shape (stretches, nodes)."""
+    """Values at the nodes -> values there, shape (bins, nodes)."""
     variance: NDArray[np.float64]
-    """Of the mean residual by noise, shape (stretches, outputs)."""
+    """Variance of the mean residual by noise, shape (bins, outputs)."""
 
 
 class _Fitted(NamedTuple):

@@ -24,7 +24,8 @@ from chargetune.runtime.cache import Built
 
 __all__ = ["Ensemble", "Prediction", "condition", "episodes_of"]
 
-# Of several studies in one process; what was learnt from a trace is used again after the next one.
+# Discrepancies and checks that are kept: what was learnt from a trace is used again after the next one. Several studies may share
+# a process.
 _LEARNT: Built = Built(8, casadi=False)
 _CHECKED: Built = Built(256, casadi=False)
 
@@ -179,7 +180,7 @@ def condition(loop: TwinLoop, trials: Sequence[TrialLike], settings: TwinSetting
 
 
 def _learnt(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode], keys: Sequence[str]) -> Discrepancy:
-    """Of the newest of these episodes; the fit begins where that of all but the last one ended."""
+    """The discrepancy that the newest of these episodes give; the fit begins where that of all but the last one ended."""
 
     def build() -> Discrepancy:
         newest = tuple(episodes[-settings.traces :])
@@ -190,7 +191,7 @@ def _learnt(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode],
 
 
 def _keys(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode]) -> list[str]:
-    """Of each of these episodes what it, all before it, the twin and the settings contain."""
+    """A key for each of these episodes: the content of it, of all before it, of the twin and of the settings."""
     digest = hashlib.blake2b(repr((loop.twin.content, dict(loop.features), settings)).encode(), digest_size=16)
     out = []
     for one in episodes:

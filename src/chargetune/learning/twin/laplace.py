@@ -99,7 +99,7 @@ class NegativeLogPosterior:
 
     def __init__(self, twin: Twin, data: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]) -> None:
         self._twin, self._inputs = twin, [u for u, _ in data]
-        # Of every sample its weight, 0 where none was measured, and what was measured times that.
+        # Weight of each sample, 0 where none was measured, and the weighted measurement.
         self._weights = [np.where(np.isfinite(y), 1.0 / spread, 0.0).ravel() for _, y in data]
         self._wanted = [weight * np.nan_to_num(y.ravel()) for (_, y), weight in zip(data, self._weights, strict=True)]
         d = len(twin.prior_factor)
