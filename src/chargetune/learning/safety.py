@@ -19,7 +19,7 @@ class Safety:
     probability
         Least predicted probability of keeping every limit that a theta needs to be tried, in [0.5, 1).
     start
-        The first theta, declared safe by the user and not checked; None: the most cautious corner of the space, which is checked.
+        The first theta, declared safe by the user and not judged; None: the most cautious corner of the space, if plants of the prior allow it.
     budget
         Largest sum of the loop's ``violation`` over all trials, for a charge in mV s beyond the voltage limit; None: no budget.
 
