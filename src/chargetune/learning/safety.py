@@ -19,7 +19,8 @@ class Safety:
     probability
         Least predicted probability of keeping every limit that a theta needs to be tried, in [0.5, 1).
     start
-        The first theta, declared safe by the user and not judged; None: the most cautious corner of the space, if plants of the prior allow it.
+        The first theta, declared safe by the user and not judged; None: the most cautious corner of the space, which plants of the prior
+        judge.
     budget
         Largest sum of the loop's ``violation`` over all trials, for a charge in mV s beyond the voltage limit; None: no budget.
 
