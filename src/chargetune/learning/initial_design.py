@@ -1,4 +1,4 @@
-"""The first thetas, and the baseline without learning: Sobol's sequence."""
+"""The initial design, theta_0 and Sobol points, and the baseline tuner that proposes nothing else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Sobol:
     seed: int = 0
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
-        """The next ``n`` points, shape (n, d); scores play no part."""
+        """The next ``n`` points, shape (n, d), whatever the scores are."""
         check_count(n)
         return initial_design(space, len(trials) + n, self.seed, len(trials), n)
 
@@ -30,13 +30,13 @@ class Sobol:
 def sobol_points(dimension: int, seed: int, first: int, n: int) -> NDArray[np.float64]:
     """Points ``first`` .. ``first + n - 1`` of the scrambled Sobol sequence in the unit cube, shape (n, d)."""
     sequence = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed))
-    # Drawn up to the next power of two, which is how a Sobol sequence is balanced, and cut.
+    # A Sobol sequence is balanced for powers of two only: it is drawn up to the next one, and cut.
     points: NDArray[np.float64] = sequence.random_base2((first + n - 1).bit_length())
     return points[first : first + n]
 
 
 def initial_design(space: ParameterSpace, n_initial: int, seed: int, told: int, n: int) -> NDArray[np.float64]:
-    """The entries ``told`` .. of D_0 that are left, at most n: theta_0, then ``n_initial`` Sobol points; shape (<= n, d)."""
+    """The next points of the initial design after ``told`` trials, at most n: theta_0, then ``n_initial`` Sobol points; shape (<= n, d)."""
     count = max(0, min(n, 1 + n_initial - told))
     if count == 0:
         return np.empty((0, space.dimension))

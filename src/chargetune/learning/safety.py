@@ -1,4 +1,4 @@
-"""Safe learning: only what is predicted to keep every limit goes to the plant."""
+"""What safe mode has to keep: the demanded probability, the first theta and the budget of violation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ __all__ = ["NoSafeThetaError", "Safety"]
 
 
 class NoSafeThetaError(RuntimeError):
-    """No theta is predicted to keep the limits with the stated probability, or the budget of violation is spent."""
+    """Nothing is proposed: no theta is predicted to keep the limits with the stated probability, or the budget of violation is spent."""
 
 
 @dataclass(frozen=True)
 class Safety:
-    """Only theta whose predicted probability of keeping every limit is at least ``probability`` goes to the plant.
+    """Demands of safe mode.
 
+    probability
+        Least predicted probability of keeping every limit that a theta needs to be tried, in [0.5, 1).
     start
-        The first theta, declared safe by the user; None: the most cautious corner of the space, which is checked.
+        The first theta, declared safe by the user and not judged; None: the most cautious corner of the space, which plants of the prior
+        judge.
     budget
-        Largest sum over all trials of the loop's ``violation``, for a charge in mV s beyond the voltage limit; None: no budget.
+        Largest sum of the loop's ``violation`` over all trials, for a charge in mV s beyond the voltage limit; None: no budget.
+
+    Raises ValueError for a probability or a budget outside these ranges.
     """
 
     probability: float = 0.95

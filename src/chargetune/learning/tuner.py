@@ -1,4 +1,4 @@
-"""What a tuner is: a pure function of the trials."""
+"""The interface of a tuner: a pure function from the trials so far to the next theta."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["TrialLike", "Tuner", "check_count"]
 
 
 class TrialLike(Protocol):
-    """The part of a trial that a tuner reads. A trial without score is running when its status says so, else it failed."""
+    """The part of a trial that a tuner reads. A trial without score is running if its status is "running"; else it failed."""
 
     @property
     def number(self) -> int: ...
@@ -31,10 +31,10 @@ class TrialLike(Protocol):
 
 
 class Tuner(Protocol):
-    """Proposes theta. A frozen dataclass with a seed: the same arguments give the same thetas, bit for bit."""
+    """Proposes the next theta. A frozen dataclass with a seed: the same arguments give the same thetas, bit for bit."""
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
-        """``n`` thetas in their own units and inside the bounds, shape (n, d)."""
+        """The next ``n`` thetas, in their own units and inside their bounds, shape (n, d)."""
         ...
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from chargetune.learning import Composite
-from chargetune.learning.black_box.composite import Passage, _Belief, _Data, _near, _Processes
+from chargetune.learning.black_box.composite import Passage, _Data, _near, _Processes, _Surrogate
 from chargetune.learning.black_box.optimize_acquisition import reproducible
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
@@ -136,7 +136,7 @@ def test_a_lap_that_was_cut_short_teaches_what_it_showed():
     data = _Data.of(Track(), SPACE, [*trials, failed])
     assert len(data.x) == 6
     with reproducible(0):
-        sd = _Belief(data).rates(torch.full((1, NODES), 0.45))[1].detach()
+        sd = _Surrogate(data).rates(torch.full((1, NODES), 0.45))[1].detach()
     assert float(sd[0, :3].max()) < 0.02 < float(sd[0, 5:].min())
 
 
@@ -162,10 +162,10 @@ def test_windows_far_from_their_limit_are_left_out():
 def test_the_objective_is_the_time_of_the_lap_and_stays_finite():
     data = _Data.of(Track(), SPACE, tuned(Composite(Track(), n_initial=3), 4))
     with reproducible(0):
-        ensemble = _Belief(data)
+        surrogate = _Surrogate(data)
         speed = torch.tensor([[1.0, 2.0, 1.5, 0.8, 2.0, 1.0, 1.0, 3.0]])
-        assert float(ensemble.objective(speed)) == pytest.approx(-float((1 / speed).sum()), rel=2e-2)
-        stuck = ensemble.objective(torch.tensor([[-1.0] * WINDOWS]))
+        assert float(surrogate.objective(speed)) == pytest.approx(-float((1 / speed).sum()), rel=2e-2)
+        stuck = surrogate.objective(torch.tensor([[-1.0] * WINDOWS]))
     assert torch.isfinite(stuck).all()
     assert float(stuck) < -Track().duration_s
 

@@ -162,7 +162,7 @@ def test_a_trace_with_holes_is_bridged():
     ("given", "said"), [({"relax": 0.0}, "relax = 0.0"), ({"relax": 1.5}, "relax = 1.5"), ({"window": 2}, "window = 2")]
 )
 def test_nonsense_is_refused_by_name(given, said):
-    with pytest.raises(ValueError, match="envelope") as caught:
+    with pytest.raises(ValueError, match="iterative learning") as caught:
         IterativeLearning(ChargingTwin(charge(ratios=(ResistanceRatio("R0"),))), **given)
     assert said in str(caught.value)
 

@@ -1,1 +1,1 @@
-"""Tuners that see scores alone: Gaussian processes and what is expected of a theta."""
+"""Tuners without a plant model: Bayesian optimisation on the scores of trials, or on what passed in windows of each trial."""

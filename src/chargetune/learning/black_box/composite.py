@@ -1,4 +1,4 @@
-"""Bayesian optimisation of known functions of many outputs: what an episode did in each of its windows, no model of the plant."""
+"""Composite Bayesian optimisation without a plant model: known functions of what an episode did in each of its windows."""
 
 from __future__ import annotations
 
@@ -26,30 +26,33 @@ from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["Composite", "CompositeLoop", "Passage"]
 
-# Side of the box about theta_0, in the unit cube, that the first points are spread over.
+# Side of the box around theta_0, in the unit cube, in which the initial points lie.
 DESIGN = 0.6
-# Standard deviations added to an excess by the cautious proposals, taken off it by those that explore, and added before a trial is
-# called the best: of many that seem to keep the limits the one that seems best is the one that noise flatters most.
+# Standard deviations: added to the predicted excess by cautious proposals, subtracted from it by exploring ones, and added to it when the
+# best trial is chosen. The last is the largest: of many trials that seem feasible, the best is the one whose noise was most favourable.
 CAUTION, OPTIMISM, TRUSTED = 1.0, 1.0, 2.0
-# A per cent of the objective weighs as much as this excess beyond the tolerance, in tolerances, in one window.
+# Weight of the penalty: this excess beyond the tolerance in one window, in tolerances, costs as much as one per cent of the objective.
 STIFFNESS = 0.5
-# The penalty makes a narrow valley along the limits: fewer iterations end on its slope, 5 % short of the best.
+# Starts and iterations of the search. The penalty makes a narrow valley along the limits: with fewer iterations the search ends on its
+# slope, 5 % short of the optimum.
 STARTS, ITERATIONS = 2, 120
-# An output that was not measured is told with this variance, so that all are fitted in one go. Outputs are scaled to about one.
+# Noise variance given to an output that was not measured, which makes it irrelevant, so that all outputs can be fitted in one batch.
+# Outputs are scaled to about one.
 UNKNOWN = 1e4
 JITTER = 1e-6
-# A window whose excess was never closer to its limit than its own range is left out.
+# A window restricts theta only if its excess came closer to the limit than this multiple of the range in which it varied.
 REACH = 1.0
-# Rates below this share of what passes a window in a whole episode are smoothly replaced by it.
+# Lower bound of a predicted rate, approached smoothly, as a share of the rate that passes one window in the longest episode: the
+# objective divides by the rate.
 SLOWEST = 0.7
 
 
 @dataclass(frozen=True)
 class Passage:
-    """One episode in w windows of a progress that it passes through once, such as the state of charge; nan where it never was.
+    """One episode, cut into w windows of a variable that only increases, such as the state of charge; nan for a window never visited.
 
-    rate (w,): progress per second in each window; excess (limits, w): the worst signed excess of each limit there, in its unit;
-    spread (limits, w): the standard deviation of that number by sensor noise.
+    rate (w,): mean increase of that variable per second in each window; excess (limits, w): the worst signed excess over each limit
+    there, in its unit; spread (limits, w): the standard deviation of that excess due to sensor noise.
     """
 
     rate: NDArray[np.float64]
@@ -58,16 +61,16 @@ class Passage:
 
 
 class CompositeLoop(Protocol):
-    """How an episode is cut into windows, and what is wanted of them."""
+    """How an episode is cut into windows, and how objective and limits follow from them."""
 
     @property
     def widths(self) -> NDArray[np.float64]:
-        """Progress that each window is wide, shape (w,)."""
+        """Width of each window, shape (w,)."""
         ...
 
     @property
     def costs(self) -> NDArray[np.float64]:
-        """What a second in each window costs, shape (w,): the objective is -sum(costs * widths / rate)."""
+        """Cost of one second in each window, shape (w,): the objective is -sum(costs * widths / rate)."""
         ...
 
     @property
@@ -77,25 +80,28 @@ class CompositeLoop(Protocol):
 
     @property
     def tolerances(self) -> NDArray[np.float64]:
-        """The excess of each limit that is still called kept, shape (limits,)."""
+        """Largest excess over each limit that still counts as kept, shape (limits,)."""
         ...
 
-    def passage(self, episode: Episode) -> Passage: ...
+    def passage(self, episode: Episode) -> Passage:
+        """What a measured episode did in each window."""
+        ...
 
 
 @dataclass(frozen=True)
 class Composite:
-    """The theta that is best for the windows' outputs as Gaussian processes of theta predict them.
+    """Bayesian optimisation of a composite function g(h(theta)): h is learnt, g is known.
 
-    h(theta) = (rate and excess of each window) are independent processes, Matern 5/2 with ARD, their noise known. Objective
-    g(h) = -sum(costs * widths / rate) and limits h <= tolerance are known functions of them, so that a window, which depends on
-    few entries of theta and nearly linearly, is all that has to be learnt. Proposed is
+    h(theta) = (rate and excess of each window) are independent Gaussian processes, Matern 5/2 with ARD and known noise. The objective
+    g(h) = -sum(costs * widths / rate) and the limits excess <= tolerance are known functions of h. Only the windows have to be learnt;
+    each depends on few entries of theta, and nearly linearly. The proposal is the theta of
 
         max g(mean rate + o sd) - penalty * sum max(0, mean excess + c sd - tolerance)^2
 
-    by turns cautious (c = 1, o = 0) and optimistic (c = -1, o = 1): what would be better if it were so is tried. After
-    theta_0 and ``n_initial`` Sobol points about it. Cut-short and failed trials teach by their traces. Running trials and the
-    earlier thetas of a batch are taken as if they had shown their means.
+    alternately cautious (c = 1, o = 0) and optimistic (c = -1, o = 1). The optimistic one explores: it tries what would be better if the
+    limits were kept. The first trials are theta_0 and ``n_initial`` Sobol points around it. Aborted and failed trials are learnt from as
+    far as their traces go. For running trials and earlier thetas of a batch the predicted means count as measured (kriging believer,
+    Ginsbourger 2010).
     Source: Astudillo and Frazier, ICML 2019 (composite functions); Xu et al., PMLR 211 (2023) 1 (optimism about limits).
     """
 
@@ -133,12 +139,12 @@ class Composite:
         return space.from_unit(np.vstack([first, *proposed]))
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
-        """Index of the trial that is believed best: no single measurement decides whether it kept the limits. None without traces."""
+        """Index of the trial that is best as the processes predict it, not as it was measured: noise flatters some. None without traces."""
         data = _Data.of(self.loop, space, trials)
         if not len(data.x):
             return None
         with reproducible(self.seed):
-            return data.numbers[_Belief(data).incumbent]
+            return data.numbers[_Surrogate(data).incumbent]
 
     def _design(self, space: ParameterSpace) -> NDArray[np.float64]:
         centre = space.to_unit(space.default)
@@ -147,19 +153,19 @@ class Composite:
         return np.vstack([centre, corner + DESIGN * points])
 
     def _proposal(self, data: _Data, count: int, failed: list[NDArray[np.float64]], seed: int) -> NDArray[np.float64]:
-        ensemble = _Belief(data)
+        surrogate = _Surrogate(data)
         cautious = (count - self.n_initial) % 2 == 1
-        merit = _Merit(ensemble, CAUTION if cautious else -OPTIMISM, 0.0 if cautious else OPTIMISM)
+        merit = _Merit(surrogate, CAUTION if cautious else -OPTIMISM, 0.0 if cautious else OPTIMISM)
         d = data.x.shape[1]
-        points = torch.cat([candidates(d, seed, ensemble.x[ensemble.incumbent]), ensemble.x])
+        points = torch.cat([candidates(d, seed, surrogate.x[surrogate.incumbent]), surrogate.x])
         away = AwayFromFailures(merit, torch.as_tensor(np.array(failed).reshape(-1, d)))
-        # The newest trials are the two sides of what is sought: one kept the limits, the other was quicker.
-        return maximise(away, points, data.x, starts=STARTS, also=ensemble.x[-STARTS:], iterations=ITERATIONS).numpy()
+        # The newest two trials enclose the optimum: the cautious one kept the limits, the optimistic one was faster.
+        return maximise(away, points, data.x, starts=STARTS, also=surrogate.x[-STARTS:], iterations=ITERATIONS).numpy()
 
 
 @dataclass(frozen=True)
 class _Data:
-    """x (n, d) in the unit cube; outputs (n, m), nan where unknown, and their noise; ``numbers`` are indices of the trials."""
+    """Thetas x (n, d) in the unit cube, outputs (n, m), nan where unknown, and their noise sd; ``numbers`` are indices of the trials."""
 
     loop: CompositeLoop
     x: NDArray[np.float64]
@@ -187,15 +193,15 @@ class _Data:
         )
 
     def believing(self, u: NDArray[np.float64]) -> _Data:
-        """With what is expected at u told as if it were measured."""
+        """The same data and one more trial at u, whose outputs are the predicted means (kriging believer)."""
         if not len(self.x):
             return self
-        ensemble = _Belief(self)
+        surrogate = _Surrogate(self)
         with torch.no_grad():
-            rate, _ = ensemble.rates(torch.as_tensor(u)[None])
-            excess, _ = ensemble.excesses(torch.as_tensor(u)[None])
+            rate, _ = surrogate.rates(torch.as_tensor(u)[None])
+            excess, _ = surrogate.excesses(torch.as_tensor(u)[None])
         filled = np.full(self.excess.shape[1], np.nan)
-        filled[ensemble.near] = excess[0].numpy()
+        filled[surrogate.near] = excess[0].numpy()
         return _Data(
             self.loop,
             np.vstack([self.x, u]),
@@ -206,8 +212,8 @@ class _Data:
         )
 
 
-class _Belief:
-    """The processes of the rates and of the excess of each window that matters, fitted to the trials so far."""
+class _Surrogate:
+    """Gaussian processes of the rate of each window, and of the excess of each window that can restrict theta, fitted to the trials."""
 
     def __init__(self, data: _Data) -> None:
         loop = data.loop
@@ -216,7 +222,7 @@ class _Belief:
         each = np.repeat(loop.tolerances, len(loop.widths))[self.near]
         spread = data.spread[:, self.near]
         self.tolerances = torch.as_tensor(each)
-        # What noise can make of an excess is not worth a large step back.
+        # Unit of the penalty: at least the noise, because an excess within the noise does not justify a much slower theta.
         noise = np.array([np.median(column[np.isfinite(column)]) for column in spread.T])
         self.units = torch.as_tensor(np.maximum(np.hypot(each, noise), 1e-12))
         self._widths, self._costs = torch.as_tensor(loop.widths), torch.as_tensor(loop.costs)
@@ -229,12 +235,12 @@ class _Belief:
             self.incumbent = int(self.merit(self.x, TRUSTED, 0.0).argmax())
 
     def objective(self, rate: torch.Tensor) -> torch.Tensor:
-        """g of rates (..., w); smooth and finite where a rate is none."""
+        """g of rates (..., w); smooth and finite also where a predicted rate is 0 or negative."""
         rate = self._least * (torch.nn.functional.softplus(rate / self._least) + 1e-2)
         return -(self._costs * self._widths / rate).sum(-1)
 
     def merit(self, x: torch.Tensor, caution: float, optimism: float) -> torch.Tensor:
-        """g(rate + optimism sd) in per cent, less the squared excess of mean + caution sd beyond the tolerance; x (b, d) -> (b,)."""
+        """g(rate + optimism sd) in per cent, minus the penalty on (excess + caution sd) beyond the tolerance; x (b, d) -> (b,)."""
         mean, sd = self.rates(x)
         excess, deviation = self.excesses(x)
         over = (excess + caution * deviation - self.tolerances).clamp_min(0.0) / self.units
@@ -243,7 +249,7 @@ class _Belief:
 
 
 class _Processes:
-    """m independent processes on the same points, mean and sd (b, m) at points (b, d)."""
+    """m independent Gaussian processes on the same inputs; a call with points (b, d) gives mean and sd, each (b, m)."""
 
     def __init__(self, x: NDArray[np.float64], y: NDArray[np.float64], spread: NDArray[np.float64]) -> None:
         self._count = y.shape[1]
@@ -253,7 +259,7 @@ class _Processes:
         count = np.maximum(known.sum(0), 1)
         mean = np.where(known, y, 0.0).sum(0) / count
         sd = np.sqrt((np.where(known, y - mean, 0.0) ** 2).sum(0) / count)
-        # Windows of one kind move by about as much: one that did not move yet is not bound to stay.
+        # Lower bound of the scale, the median of all windows: a window that has not changed yet can still change as the others do.
         least = float(np.median(sd[sd > 0])) if np.any(sd > 0) else 1.0
         scale = np.maximum(sd, least)
         self._mean, self._scale = torch.as_tensor(mean), torch.as_tensor(scale)
@@ -264,7 +270,7 @@ class _Processes:
     def __call__(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         if not self._count:
             return x.new_empty(len(x), 0), x.new_empty(len(x), 0)
-        # The processes are asked at points they were fitted to as well.
+        # GPyTorch warns of predictions at the training points, which are wanted here.
         with gpytorch.settings.debug(state=False):
             found: Any = self.model(x.expand(self._count, *x.shape) if self._count > 1 else x)
         mean, variance = found.mean.reshape(self._count, -1).T, found.variance.reshape(self._count, -1).T
@@ -277,7 +283,7 @@ def _fitted(x: torch.Tensor, y: torch.Tensor, variance: torch.Tensor) -> SingleT
     def fresh() -> SingleTaskGP:
         kernel = get_covar_module_with_dim_scaled_prior(ard_num_dims=x.shape[1], batch_shape=batch, use_rbf_kernel=False)
         with warnings.catch_warnings():
-            # Scaled by hand, because unknown values have no part in mean and sd.
+            # BoTorch warns of outputs that are not standardised. They are scaled above, where unknown values are left out of mean and sd.
             warnings.simplefilter("ignore")
             return SingleTaskGP(x, y, train_Yvar=variance, covar_module=kernel, outcome_transform=None)
 
@@ -287,7 +293,7 @@ def _fitted(x: torch.Tensor, y: torch.Tensor, variance: torch.Tensor) -> SingleT
 
 
 def _near(excess: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which windows may restrict theta: those whose excess came closer to the limit than it varied."""
+    """Which windows can restrict theta: those whose excess came closer to the limit than `REACH` times the range of its values."""
     known = np.isfinite(excess)
     worst = np.where(known, excess, -np.inf).max(axis=0, initial=-np.inf)
     least = np.where(known, excess, np.inf).min(axis=0, initial=np.inf)
@@ -296,13 +302,13 @@ def _near(excess: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class _Merit(AcquisitionFunction):
-    """`_Belief.merit` as BoTorch asks for it."""
+    """`_Surrogate.merit` with the interface of a BoTorch acquisition function."""
 
-    def __init__(self, ensemble: _Belief, caution: float, optimism: float) -> None:
-        super().__init__(model=ensemble.rates.model)
-        self._belief, self._caution, self._optimism = ensemble, caution, optimism
+    def __init__(self, surrogate: _Surrogate, caution: float, optimism: float) -> None:
+        super().__init__(model=surrogate.rates.model)
+        self._surrogate, self._caution, self._optimism = surrogate, caution, optimism
 
     @t_batch_mode_transform(expected_q=1, assert_output_shape=False)  # type: ignore[arg-type] # it types self as the base class
     def forward(self, X: torch.Tensor) -> torch.Tensor:
         """X (b, 1, d) -> (b,)."""
-        return self._belief.merit(X[:, 0], self._caution, self._optimism)
+        return self._surrogate.merit(X[:, 0], self._caution, self._optimism)

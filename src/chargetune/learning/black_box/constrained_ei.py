@@ -25,16 +25,17 @@ from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["ConstrainedLogEI", "Limit", "limits_of", "marginals"]
 
+# Samples of the Monte Carlo form of the acquisition, used with pending points.
 SAMPLES = 128
-# asinh(excess / scale) is linear near the limit, where the optimum lies, and logarithmic far away.
+# Scale of the transform asinh(excess / scale), in tolerances: linear near the limit, where the optimum lies, and logarithmic far away.
 SCALE_TOLERANCES = 20.0
-# A limit that was never closer to its bound than this share of its own spread does not restrict theta.
+# A limit restricts theta only if its excess came closer to the bound than this share of the range of its values.
 REACH = 0.25
 
 
 @dataclass(frozen=True)
 class Limit:
-    """Excess of one limit, or of one window of it, over the trials that have it: asinh-scaled, kept where <= ``bound``."""
+    """Excess over one limit, or in one window of it, in the trials that have it: transformed by asinh, kept where <= ``bound``."""
 
     name: str
     rows: NDArray[np.int64]
@@ -43,10 +44,10 @@ class Limit:
 
 
 def limits_of(trials: Sequence[TrialLike]) -> list[Limit]:
-    """The limits that matter among the done trials, each window of a profile on its own.
+    """The limits that can restrict theta, from the finished trials; each window of a profile counts as a limit.
 
-    The transform is monotone and maps the tolerance to the bound, so that kept stays kept. A window an episode never
-    reached gives no value, rather than a made-up one.
+    The transform is monotone and maps the tolerance to the bound, so that it does not change which limits are kept. A window that an
+    episode did not reach has no value.
     """
     columns: dict[str, list[tuple[int, float, float]]] = {}
     for row, trial in enumerate(trials):
@@ -76,11 +77,11 @@ def limits_of(trials: Sequence[TrialLike]) -> list[Limit]:
 class ConstrainedLogEI:
     """Constrained log expected improvement over the best theta that kept every limit.
 
-    The objective and the excess of each limit (each window of it, where the score has a profile) are separate
-    Gaussian processes. While no trial kept the limits, the probability of keeping them is maximised. The objective is
-    learned as -log(1 + (best - objective) / median), which is monotone and keeps bad trials from dominating the fit.
-    Failed trials have no score; the acquisition keeps away from them. Batches and running trials: Monte Carlo form
-    with pending points. D_0 is theta_0 and ``n_initial`` Sobol points.
+    The objective and the excess over each limit (in each window, where the score has a profile) are separate
+    Gaussian processes. As long as no trial kept the limits, the probability of keeping them is maximised instead. The objective is
+    learnt as -log(1 + (best - objective) / median), which is monotone and prevents bad trials from dominating the fit.
+    Failed trials have no score; the acquisition is lowered near them. For batches and running trials the Monte Carlo form
+    with pending points is used. The initial design is theta_0 and ``n_initial`` Sobol points.
     Sources: Gardner et al., ICML 2014; Ament et al., NeurIPS 2023.
     """
 
@@ -118,7 +119,7 @@ class ConstrainedLogEI:
 
 @dataclass(frozen=True)
 class _Models:
-    """Output 0 is the objective, the others are the limits; ``incumbent`` is a row of the done trials."""
+    """Fitted models: output 0 is the objective, the others are the limits; ``incumbent`` is an index into the finished trials."""
 
     model: ModelListGP
     bounds: tuple[float, ...]
@@ -132,7 +133,7 @@ class _Models:
         objective = -np.log1p(behind / (np.median(behind) or 1.0))
         feasible = np.array([s.feasible for s in scores])
         limits = limits_of(done)
-        # What all trials have is fitted in one go, which is several times quicker than one by one.
+        # Outputs that all trials have are fitted in one batch, several times faster than one by one.
         limits.sort(key=lambda limit: len(limit.rows) < len(done))
         whole = [limit.values for limit in limits if len(limit.rows) == len(done)]
         fitted = [surrogate.fit(x, torch.as_tensor(np.column_stack([objective, *whole])))]
@@ -165,7 +166,7 @@ class _Models:
 def marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and sd of each output at single points x (b, 1, d), shapes (b, m); the same as from ``model.posterior``.
 
-    The surrogates are independent, so their joint covariance, which the general way builds, is not needed: 6 times quicker.
+    The models are independent, so that the joint covariance, which ``model.posterior`` builds, is not needed: 6 times faster.
     """
     means, deviations = [], []
     for part in model.models:
@@ -182,14 +183,14 @@ def marginals(model: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class _ExpectedImprovement(LogConstrainedExpectedImprovement):
-    """BoTorch's acquisition with `marginals`."""
+    """BoTorch's constrained log expected improvement, with `marginals` for speed."""
 
     def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
         return marginals(self.model, X)
 
 
 class _ProbabilityOfFeasibility(LogProbabilityOfFeasibility):
-    """BoTorch's acquisition with `marginals`."""
+    """BoTorch's log probability of feasibility, with `marginals` for speed."""
 
     def _mean_and_sigma(self, X: torch.Tensor, *_: object, **__: object) -> tuple[torch.Tensor, torch.Tensor]:
         return marginals(self.model, X)

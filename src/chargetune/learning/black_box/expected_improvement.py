@@ -1,4 +1,4 @@
-"""The paper's method: one GP on the scalar performance G, expected improvement over the best G."""
+"""Expected improvement, the method of the paper: one Gaussian process on the scalar performance G."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from chargetune.model.parameter_space import ParameterSpace
 
 __all__ = ["ExpectedImprovement", "expected_improvement"]
 
+# Samples of the Monte Carlo form of the acquisition, used with pending points.
 SAMPLES = 128
 
 
@@ -42,9 +43,9 @@ def expected_improvement(mean: torch.Tensor, sd: torch.Tensor, best: float) -> t
 class ExpectedImprovement:
     """Algorithm 1 of Hirt et al. (ADCHEM 2024): GP on G(theta), next theta by expected improvement.
 
-    D_0 is theta_0 and ``n_initial`` scrambled Sobol points. In a batch, and while trials are running, the Monte Carlo
-    form of log EI takes the pending points into account jointly; no value is invented for them. Failed trials have no
-    G; the acquisition keeps away from them.
+    The initial design is theta_0 and ``n_initial`` scrambled Sobol points. In a batch, and while trials are running, the Monte Carlo
+    form of log EI takes the pending points into account jointly, without an invented value. Failed trials have no
+    G; the acquisition is lowered near them.
     """
 
     seed: int = 0

@@ -1,4 +1,4 @@
-"""Keeping away from where trials failed, without inventing a score for them."""
+"""A penalty on the acquisition near failed trials, which have no score."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from botorch.utils.transforms import t_batch_mode_transform
 
 __all__ = ["AwayFromFailures"]
 
-# Radius of the region a failure speaks for, as a share of the cube's diagonal.
+# Radius of the region around a failed trial in which failure is likely, as a share of the diagonal of the unit cube.
 RADIUS = 0.05
 
 
 class AwayFromFailures(AcquisitionFunction):
     """log a(x) + sum_j log(1 - exp(-|x - x_j|^2 / (2 r^2))) with failed trials x_j and r = 0.05 sqrt(d).
 
-    The second term is the log probability of success under independent failure regions that fade with distance.
+    The second term is the log probability of success at x if each failed trial x_j causes failure there with the probability
+    exp(-|x - x_j|^2 / (2 r^2)), independently of the others.
     """
 
     def __init__(self, base: AcquisitionFunction, failed: torch.Tensor) -> None:

@@ -24,15 +24,16 @@ from torch.linalg import LinAlgError  # type: ignore[attr-defined] # documented,
 
 __all__ = ["FAILURES", "GaussianProcess", "SurrogateWarning", "fitted", "posterior"]
 
-# Nothing here needs more iterations: later ones change the hyperparameters in their third digit.
+# Iterations of a fit, at most: later ones change the hyperparameters in their third digit.
 FIT_ITERATIONS = 30
+# Lower bound of a learnt noise variance, in units of the scaled output.
 NOISE_LEAST = 1e-6
-# What a matrix that is singular to rounding, or a flat function, ends with; anything else is a standardised_error in the program.
+# Exceptions that a matrix that is singular to rounding, or a flat function, can raise. Any other exception is a defect of the program.
 FAILURES = (ModelFittingError, OptimizationGradientError, NanError, NotPSDError, LinAlgError)
 
 
 class SurrogateWarning(UserWarning):
-    """A surrogate could not be fitted; it works on with the hyperparameters it started from."""
+    """A surrogate could not be fitted; it keeps the hyperparameters from which the fit started."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ class GaussianProcess:
     standardise
         Fit (y - mean) / sd instead of y.
     noise
-        Fixed noise variance in the fitted unit; None learns it.
+        Fixed noise variance, in the unit in which it is fitted; None: it is learnt.
     iterations
-        Of the search for the hyperparameters, at most.
+        Largest number of iterations of the search for the hyperparameters.
     """
 
     mean: Callable[[], Mean] | None = None
@@ -60,7 +61,7 @@ class GaussianProcess:
     iterations: int = FIT_ITERATIONS
 
     def fit(self, x: torch.Tensor, y: torch.Tensor) -> SingleTaskGP:
-        """The surrogate for x (n, d) and y (n,) or (n, m), m independent ones fitted at once; hyperparameters by log marginal likelihood.
+        """The surrogate for x (n, d) and y (n,), or m independent surrogates for y (n, m) fitted in one batch, by log marginal likelihood.
 
         Raises ValueError for shapes that do not fit or values that are not finite.
         """
@@ -88,7 +89,7 @@ class GaussianProcess:
             likelihood = GaussianLikelihood(noise_constraint=GreaterThan(NOISE_LEAST), batch_shape=batch)
             likelihood.initialize(noise=1e-3)
         with warnings.catch_warnings():
-            # The user may choose not to standardise.
+            # BoTorch warns of outputs that are not standardised, which is the user's choice here.
             warnings.simplefilter("ignore")
             model = SingleTaskGP(
                 x,
@@ -103,16 +104,16 @@ class GaussianProcess:
 
 
 def fitted(make: Callable[[], SingleTaskGP], what: str, *, attempts: int, iterations: int | None = None) -> SingleTaskGP:
-    """What ``make`` gives, with the hyperparameters of the largest marginal likelihood times priors.
+    """The model of ``make`` with fitted hyperparameters: maximum of marginal likelihood times priors.
 
-    Where they cannot be found (`FAILURES`) it keeps those it begins with, and a `SurrogateWarning` says so. Further ``attempts`` begin at
-    a draw of torch's global generator: it has to be called within `reproducible`.
+    If the fit fails (`FAILURES`), the model keeps its initial hyperparameters, with a `SurrogateWarning` that names ``what``. ``attempts``
+    after the first start from a draw of torch's global generator, so that the caller has to be inside `reproducible`.
     """
     model = make()
     options = None if iterations is None else {"options": {"maxiter": iterations}}
     try:
         with warnings.catch_warnings():
-            # An iteration limit is no failure here, see FIT_ITERATIONS.
+            # BoTorch warns when the iteration limit is reached, which is no failure here, see FIT_ITERATIONS.
             warnings.simplefilter("ignore")
             fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model), optimizer_kwargs=options, max_attempts=attempts)
     except FAILURES as error:

@@ -18,24 +18,26 @@ from chargetune.learning.initial_design import sobol_points
 
 __all__ = ["candidates", "maximise", "reproducible"]
 
+# Points that are evaluated first: Sobol points over the unit cube, and normal steps around the incumbent for each of these lengths.
 SOBOL_POINTS = 128
 LOCAL_POINTS = 48
 LOCAL_SCALES = (0.02, 0.06, 0.15)
+# Gradient searches, from the best of those points, and their iterations at most.
 STARTS = 2
 ITERATIONS = 40
-# Two thetas closer than this in the unit cube are the same experiment.
+# Two thetas closer than this in the unit cube, in every entry, count as the same trial.
 DUPLICATE = 1e-6
 
 
 @contextmanager
 def reproducible(seed: int) -> Iterator[None]:
-    """Torch's random numbers from ``seed``, one thread, double precision; all as before afterwards."""
+    """Context with torch's random numbers from ``seed``, one thread and double precision; afterwards all is as before."""
     threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
-        # linear_operator's own use of torch, which its users cannot change.
+        # Warnings about linear_operator's own use of torch, which its users cannot change.
         warnings.filterwarnings("ignore", "TypedStorage is deprecated|.*[Ss]parse", UserWarning)
         torch.manual_seed(seed)
-        # For matrices of a hundred rows more threads cost time, and their sums depend on how many there are.
+        # For matrices of a hundred rows more threads cost time, and the rounding of sums depends on their number.
         torch.set_num_threads(1)
         torch.set_default_dtype(torch.float64)
         try:
@@ -46,7 +48,7 @@ def reproducible(seed: int) -> Iterator[None]:
 
 
 def candidates(dimension: int, seed: int, around: torch.Tensor | None) -> torch.Tensor:
-    """Where to look first: Sobol points everywhere and normal steps of several lengths around the incumbent."""
+    """Points (m, d) that are evaluated first: Sobol points over the cube, and normal steps around the incumbent ``around``, if given."""
     everywhere = torch.from_numpy(sobol_points(dimension, seed, 0, SOBOL_POINTS))
     if around is None:
         return everywhere
@@ -64,9 +66,10 @@ def maximise(
     also: torch.Tensor | None = None,
     iterations: int = ITERATIONS,
 ) -> torch.Tensor:
-    """The best point found, shape (d,), never one of ``taken`` again.
+    """The maximiser of the acquisition as far as it was found, shape (d,), and none of ``taken``.
 
-    L-BFGS-B from the ``starts`` best of ``points`` (m, d), and from ``also`` (k, d).
+    L-BFGS-B from the ``starts`` best of ``points`` (m, d), and from ``also`` (k, d). If it fails, the best of ``points``, with a
+    RuntimeWarning.
     """
     with torch.no_grad():
         values = acquisition(points[:, None, :])
@@ -77,7 +80,7 @@ def maximise(
     d = points.shape[1]
     try:
         with warnings.catch_warnings():
-            # The iteration limit is meant.
+            # BoTorch warns when the iteration limit is reached, which is intended here.
             warnings.simplefilter("ignore")
             found, value = optimize_acqf(
                 acquisition, torch.stack([torch.zeros(d), torch.ones(d)]), 1, num_restarts=len(start), batch_initial_conditions=start,
@@ -86,7 +89,7 @@ def maximise(
         if value is not None and torch.isfinite(value).all() and torch.isfinite(found).all():
             best = found[0]
     except (*FAILURES, CandidateGenerationError) as error:
-        # A flat or ill-conditioned acquisition.
+        # The acquisition is flat or ill-conditioned.
         warnings.warn(f"the acquisition was not maximised, the best of {len(points)} points stands ({error})", RuntimeWarning, stacklevel=2)
     done = torch.as_tensor(np.asarray(taken, dtype=float)).reshape(-1, d)
     if len(done) and (done - best).abs().amax(1).min() < DUPLICATE:

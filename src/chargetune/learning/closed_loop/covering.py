@@ -1,4 +1,4 @@
-"""The theta with which the controller's own predictions cover what was measured."""
+"""Covering: the theta with which the controller's own predictions are at least as cautious as what was measured, by a linear program."""
 
 from __future__ import annotations
 
@@ -19,36 +19,28 @@ from chargetune.runtime.numpy_call import numpy_call
 
 __all__ = ["covering", "predicted_rows"]
 
-# What a sample that cannot be covered costs, beside the mean surplus over all samples.
+# Penalty on a sample that is not covered, relative to the cost of the mean surplus: large, so that a sample stays uncovered only where no
+# theta covers it.
 UNCOVERED = 1e4
-
-
-# What moving an entry over its whole range costs, as a share of the largest change wanted: what no sample asks for stays.
+# Cost of moving an entry over its whole range, as a share of the largest wanted change: an entry that no sample needs stays where it is.
 MOVING = 1e-3
-
-
-# The rows are linearised at the theta of the episode, and once more at the first solution.
+# Linear programs, at most: the rows are linearised at the theta of the episode, and once more at the first solution.
 LINEARISATIONS = 2
-
-
-# Of what is noticed of a limit, the difference from a straight line that is none.
+# Largest difference from the linearisation at which rows count as linear in theta, in units of the limit's scale. Then a second program
+# would give the same solution.
 STRAIGHT = 1e-6
-
-
-# A row of which neither plant nor controller was ever closer to its limit than this share of its spread is not covered.
+# A row is covered only if plant or controller came closer to its limit than this share of the range of its values.
 REACH = 0.25
-
-
-# An input within this share of its range is at its bound.
+# An input counts as being at its bound within this share of its range.
 AT_BOUND = 1e-3
 
 
 def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The controller's own prediction of its limits' rows one interval ahead, along a recorded episode, if its theta had been ``theta``.
+    """The excess over each limit that the controller would have predicted along a recorded episode, one interval ahead, with ``theta``.
 
-    Rows at both ends of each interval, shape (K, 2, rows), and their slopes with respect to theta, shape (K, 2, rows, d): the
-    estimator is run again along the recorded inputs and outputs, its state's sensitivity with it. nan where a limit does not
-    apply at that end.
+    Returns the rows of the limits at both ends of each interval, shape (K, 2, rows), and their slopes with respect to theta, shape
+    (K, 2, rows, d). The estimator is run again along the recorded inputs and outputs, together with the sensitivity of its memory. nan
+    where a limit does not apply at that end.
     """
     memory = controller.estimator.initial(controller.model, np.array(controller.start))
     step, of_fixed, _ = _rolled(controller)
@@ -57,7 +49,7 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
     for i, name in enumerate(names):
         start, end = episode.signal(name)
         received[1:, i] = end[:-1]
-        # A state is the same on both sides of the input's first jump, an output is not.
+        # Before the first input only a state is known: it is the same on both sides of the jump of the input, an output is not.
         if name in controller.model.state_names:
             received[0, i] = start[0]
     last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
@@ -80,21 +72,22 @@ def covering(
         min   mean_k c_k(theta') + UNCOVERED mean_k t_k + moving sum_i |theta'_i - theta_i| / range_i
         s.t.  c_k(theta') >= e_k - t_k,  t_k >= 0,  theta' in its bounds
 
-    In an interval whose input was at its bound, and which kept the limit nevertheless, only max(0, c_k(theta')) counts.
+    c: predicted rows (`predicted_rows`), linearised around ``theta``; e: ``measured`` rows, shape (K, 2, rows), in the unit of each limit,
+    nan where nothing was measured; t: what stays uncovered. Where the input was at its bound and the limit was kept, the limit did not
+    decide the input: there only max(0, c_k(theta')) counts.
 
-    c: predicted rows, linear in theta' around ``theta``; e: ``measured`` rows. A controller that keeps its limits with such a
-    theta keeps them on the plant wherever it was measured, and rides them. A linear program (HiGHS); where that fails, with a
-    RuntimeWarning, theta as it is.
-    Raises ValueError when there is nothing to cover.
+    With such a theta a controller that keeps its predicted limits also keeps those of the plant wherever it was measured, with the least
+    surplus. The program is solved by HiGHS; if that fails, theta is returned unchanged, with a RuntimeWarning.
+    Raises ValueError when no measured row is finite.
     """
     lower, upper = controller.theta.lower, controller.theta.upper
     full = _at_bound(controller, episode, theta)
     rows, slopes = predicted_rows(controller, episode, theta)
     near = _near(controller, measured, rows)
-    # In units of what is noticed of each limit, kelvin and volt count alike.
+    # Rows are divided by the scale of their limit, so that kelvins and volts can be added.
     scale = np.concatenate([np.full(limit.rows.size1_out(0), limit.scale) for limit in controller.limits])
     for number in range(LINEARISATIONS):
-        # Where the input is at its bound the limit does not decide it: there the prediction only has to stay below.
+        # Where the input is at its bound the limit does not decide it: there the predicted row only has to stay below 0.
         idle = full[:, None, None] & (measured <= 0)
         wanted = np.where(near, (np.where(idle, 0.0, measured) - rows) / scale, np.nan).ravel()
         free = np.broadcast_to(idle, rows.shape).ravel()
@@ -105,7 +98,7 @@ def covering(
         n, d = int(known.sum()), len(theta)
         free, wanted, steep = free[known], wanted[known], steep[known]
         moved = np.where(free[:, None], 0.0, steep).sum(axis=0) / n
-        # +1: uncovered by t >= wanted - slope; -1: above its limit by t >= slope - wanted.
+        # Sign +1: t is what is uncovered, t >= wanted - slope; -1: t is the excess over the limit, t >= slope - wanted.
         sign = np.where(free, -1.0, 1.0)
         moving = MOVING * float(np.max(np.abs(wanted))) / (upper - lower)
         # theta' - theta as the difference of two numbers >= 0, so that its size is linear too.
@@ -114,10 +107,10 @@ def covering(
         matrix = hstack([-signed, signed, -identity(n)]).tocsc()
         most = np.concatenate([np.maximum(upper - theta, 0.0), np.maximum(theta - lower, 0.0), np.full(n, np.inf)])
         bounds = np.stack([np.zeros_like(most), most], axis=1)
-        # Presolve took two fifths of the time and saved no iteration.
+        # Without presolve, which took two fifths of the time and saved no iteration.
         found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=bounds, method="highs", options={"presolve": False})
         if found.x is None:
-            warnings.warn(f"an envelope step of {n} samples has no solution, theta stays ({found.message})", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"the linear program of {n} samples has no solution, theta stays ({found.message})", RuntimeWarning, stacklevel=2)
             return theta
         before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
         if number + 1 == LINEARISATIONS or _rolled(controller).straight:
@@ -125,15 +118,15 @@ def covering(
         straight = rows + slopes @ (theta - before)
         rows, slopes = predicted_rows(controller, episode, theta)
         if np.all(np.abs(rows - straight) <= STRAIGHT * scale, where=np.isfinite(straight)):
-            # They are linear in what has changed, as in a backoff or in R0: the same program would lead here again.
+            # The rows are linear in the entries that have changed, such as a backoff or R0: a second program would give the same theta.
             break
     return np.asarray(theta, dtype=np.float64)
 
 
 def _near(controller: Controller, measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which rows are to be covered: those of a limit that the plant or, with its backoff, the controller came close to.
+    """Which rows are covered: those to which the plant came close or, with its backoff, the controller; shape (rows,).
 
-    Of each limit the closer side, because the other one asks for the opposite.
+    Of a limit with a lower and an upper side only the closer side, because the two ask for opposite changes of theta.
     """
     if not np.any(np.isfinite(measured)):
         raise ValueError("nothing to cover: no measured row is finite")
@@ -147,7 +140,7 @@ def _near(controller: Controller, measured: NDArray[np.float64], predicted: NDAr
 
 
 def _closeness(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Largest value of each row as a share of its spread, shape (rows,); -inf where none is finite."""
+    """Largest value of each row as a share of the range of its values, shape (rows,); -inf where none is finite."""
     flat = np.where(np.isfinite(rows), rows, np.nan).reshape(-1, rows.shape[-1])
     known = np.isfinite(flat).any(axis=0)
     most, least = (pick(np.where(known, flat, 0.0), axis=0) for pick in (np.nanmax, np.nanmin))
@@ -165,14 +158,14 @@ def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float6
 
 
 class _Rolled(NamedTuple):
-    """One interval of the rows that a controller predicts."""
+    """CasADi functions for one interval of `predicted_rows`."""
 
     step: ca.Function
-    """(memory, its slopes, received, last input, input, q) -> (memory, its slopes, rows, theirs) an interval ahead."""
+    """(memory, its slopes, received outputs, last input, input, q) -> (memory, its slopes, rows, slopes of the rows) one interval ahead."""
     of_fixed: ca.Function
-    """(theta, p) -> q."""
+    """(theta, p) -> q: what depends on these alone, computed once."""
     straight: bool
-    """Whether the rows are linear in theta, whatever was recorded."""
+    """Whether the rows are linear in theta for every recorded episode."""
 
 
 def _rolled(controller: Controller) -> _Rolled:
@@ -199,7 +192,7 @@ def _step(controller: Controller) -> _Rolled:
             rows.append(row if applies else ca.SX.nan(*row.shape))
     every = ca.vertcat(*rows)
 
-    # Most thetas are of limits and of resistances, which the estimator knows nothing of.
+    # The estimator often does not depend on theta, for example if theta is in the limits only; then its memory has no slopes.
     known = not ca.depends_on(ahead, theta)
 
     def total(value: Any) -> Any:

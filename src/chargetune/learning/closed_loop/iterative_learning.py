@@ -1,4 +1,4 @@
-"""Iterative learning without a plant model: make what the controller predicts cover what was measured."""
+"""Iterative learning without a plant model: after each trial, theta is corrected so that the controller predicts what was measured."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from chargetune.episode.episode import Episode
-from chargetune.learning.closed_loop.covering import (
-    covering,
-    predicted_rows,
-)
+from chargetune.learning.closed_loop.covering import covering, predicted_rows
 from chargetune.learning.closed_loop.loop import ClosedLoop
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
@@ -23,11 +20,13 @@ __all__ = ["IterativeLearning"]
 
 @dataclass(frozen=True)
 class IterativeLearning:
-    """Iterative learning: the theta whose predictions cover what was measured last, filtered and damped. No model of the plant.
+    """The theta whose predictions cover what the last trial measured (`covering`).
 
-    Per sample the error of the controller's prediction, e_k - c_k at the newest trace, is smoothed (Savitzky-Golay, order 2) and
-    covered in full where it asks for caution, by the share ``relax`` where it allows more. First theta_0, or ``start``.
-    Quick, and without a promise: it does not know what it has not seen. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
+    At every sample of the newest trace the error of the controller's prediction is e_k - c_k: measured minus predicted excess over a
+    limit. It is smoothed (Savitzky-Golay filter, order 2, ``window`` samples), then added to the prediction: in full where it asks for
+    more caution, by the share ``relax`` where it allows less. The first theta is ``start``, or theta_0.
+    It is fast and promises nothing: it knows only what the last trial went through.
+    Raises ValueError for relax outside (0, 1] or window below 3. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
     """
 
     loop: ClosedLoop
@@ -37,12 +36,12 @@ class IterativeLearning:
 
     def __post_init__(self) -> None:
         if isinstance(self.relax, bool) or not 0.0 < self.relax <= 1.0:
-            raise ValueError(f"envelope: relax = {self.relax!r}, allowed is (0, 1]")
+            raise ValueError(f"iterative learning: relax = {self.relax!r}, allowed is (0, 1]")
         if isinstance(self.window, bool) or not isinstance(self.window, int) or self.window < 3:
-            raise ValueError(f"envelope: window = {self.window!r}, allowed is an integer >= 3")
+            raise ValueError(f"iterative learning: window = {self.window!r}, allowed is an integer >= 3")
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
-        """The next theta, ``n`` times: a step needs the trial before it. Shape (n, d)."""
+        """The next theta, repeated ``n`` times, because each step needs the trial before it; shape (n, d)."""
         check_count(n)
         first = space.default if self.start is None else space.validate(np.array(self.start))
         for trial in reversed(trials):
@@ -62,7 +61,7 @@ class IterativeLearning:
 
 
 def _smooth(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Along the first axis; what is not finite stays so and is bridged."""
+    """Values (K, ...) smoothed along the first axis; gaps are interpolated for the filter and stay nan in the result."""
     out, at = np.full_like(values, np.nan), np.arange(len(values))
     length = min(window, len(values))
     for index in np.ndindex(*values.shape[1:]):

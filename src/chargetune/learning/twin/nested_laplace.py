@@ -1,4 +1,4 @@
-"""A posterior in sections along the unknown of which Laplace's Gaussian says least."""
+"""Nested Laplace approximation: a posterior on a grid of one unknown, Gaussian in the others at each grid point."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from scipy.optimize import least_squares
 
 __all__ = ["Section", "nested_laplace"]
 
-# Sections are one of Laplace's standard deviations apart. Each is half as wide: their sum is flat between two that are as likely.
+# Standard deviation of each section along the grid, in grid steps (one step is one standard deviation of Laplace's Gaussian): half a step,
+# because the sum of two equally likely neighbours is then flat between them.
 WIDTH = 0.5
-# Beyond a section that is less likely than the likeliest by this, in the logarithm, none is sought, nor more than so many to a side.
+# The grid ends on each side where the log density is this much below its maximum, and after so many points at most.
 NEGLIGIBLE, MOST = 6.0, 8
-# Where so many standard deviations away the loss differs from Laplace's by this factor, the posterior is another than his.
+# The grid is used only if, so many standard deviations from the mode, the loss differs from Laplace's parabola by more than this factor.
 ASIDE, UNLIKE = 3, 1.3
-# A density that falls by more than this, in the logarithm, from the mode to the next section is too fine for sections; a Gaussian: 0.5.
+# Largest change of the log density from the mode to the next grid point for which the grid is fine enough; a Gaussian has 0.5.
 STEEP = 1.5
-# A section is found as well as a draw can tell.
+# Tolerances of the least squares at a grid point, and evaluations at most: the result only has to be as exact as a draw shows.
 FTOL, XTOL, EVALUATIONS = 1e-4, 1e-3, 30
 
 
 class Loss(Protocol):
-    """|r(e)|^2, which is minus twice the log posterior but for a constant."""
+    """Residuals r(e) with |r(e)|^2 = -2 log posterior + constant."""
 
     def values(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
         """r, shape (n,)."""
@@ -36,7 +37,7 @@ class Loss(Protocol):
 
 
 class Section(NamedTuple):
-    """One of the Gaussians whose sum the posterior is: its share, mean, and a root of its covariance."""
+    """One Gaussian of the mixture, at one grid point: its share, its mean (d,), and a root of its covariance (d, d)."""
 
     share: float
     mode: NDArray[np.float64]
@@ -44,16 +45,17 @@ class Section(NamedTuple):
 
 
 def nested_laplace(loss: Loss, mode: NDArray[np.float64], root: NDArray[np.float64], entries: Sequence[int]) -> list[Section]:
-    """p(e) as a sum of Gaussians along one of the ``entries`` of e; none where Laplace's, of this mode and root, says as much.
+    """The posterior p(e) as a mixture of Gaussians on a grid of one of the ``entries`` of e.
 
-    Nor where the density changes too fast for them.
-    With L(c) the least loss where e_j = c, and H(c) the Gauss-Newton curvature of the other entries there,
+    ``mode`` and ``root``: Laplace's Gaussian, N(mode, root root'). The result is empty where that Gaussian is good enough, and where the
+    density changes too fast for the grid. With L(c) the least loss with e_j = c, and H(c) the Gauss-Newton curvature of the other entries
+    there,
 
         p(e_j = c) ~ |H(c)|^(-1/2) exp(-L(c) / 2),
 
-    and given c the others are Gaussian around what attains L(c), covariance H(c)^-1. Of the entries the one is taken along which the loss
-    rises least, compared to Laplace's. A wrong capacity is made up for by resistances at every SOC: the loss along both is no
-    parabola, and the truth was at four standard deviations of one.
+    and given c the other entries are Gaussian around the minimiser, with covariance H(c)^-1. The grid is along the entry whose loss rises
+    least compared with Laplace's parabola. An example is the capacity: resistances at every SOC can compensate a wrong one, so that the
+    loss along it is no parabola, and the true value was up to four of Laplace's standard deviations away.
     Source: Rue, Martino and Chopin, J. R. Stat. Soc. B 71 (2009) 319, section 3.
     """
     walks = [_Walk(loss, mode, root, j) for j in entries]
@@ -73,7 +75,7 @@ class _At(NamedTuple):
 
 
 class _Walk:
-    """What is likeliest with entry j so many standard deviations from the mode."""
+    """Conditional modes along entry j, at whole numbers of standard deviations from the mode; each is computed once."""
 
     def __init__(self, loss: Loss, mode: NDArray[np.float64], root: NDArray[np.float64], j: int) -> None:
         self._loss, self._mode, self._root, self._j = loss, mode, root, j
@@ -82,12 +84,12 @@ class _Walk:
         self._known: dict[int, _At] = {}
 
     def rise(self, k: int) -> float:
-        """By how much the loss grows over k steps, relative to Laplace's parabola."""
+        """Growth of the loss from the mode to grid point k, relative to Laplace's parabola."""
         return (self._at(k).loss - self._least) / k**2
 
     @property
     def steepness(self) -> float:
-        """The largest change of the logarithm of the density from the mode to the next section."""
+        """Largest change of the log density from the mode to the next grid point."""
         return max(abs(self._at(k).log_density - self._at(0).log_density) for k in (-1, 1))
 
     def sections(self) -> list[Section]:
@@ -114,12 +116,12 @@ class _Walk:
                 return np.insert(rest, j, value)
 
             if not others.any():
-                # One unknown: nothing is left to be found, and nothing to be uncertain of.
+                # With one unknown no other entry is left to be optimised.
                 at = whole(np.zeros(0))
                 loss = float(np.sum(self._loss.values(at) ** 2))
                 self._known[k] = _At(-0.5 * loss, at, np.zeros((1, 0)), loss)
                 return self._known[k]
-            # From the neighbour, or where Laplace's Gaussian has the others.
+            # Start from the neighbouring grid point, or from the conditional mean of Laplace's Gaussian.
             neighbour = self._known.get(k - int(np.sign(k)))
             begin = neighbour.mode if neighbour else self._mode + k * (self._root @ self._root[j]) / self._sd
             found = least_squares(
