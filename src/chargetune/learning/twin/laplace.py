@@ -28,6 +28,9 @@ __all__ = ["NegativeLogPosterior", "fit"]
 
 # Tolerances of the least squares: a change of the loss, or of the unknowns, by less is not worth another evaluation.
 FTOL, XTOL, EVALUATIONS = 1e-6, 1e-5, 30
+# The same of the first fit of several, of which only the size of the residuals is used: with noise alone a plant of another kind has a
+# long valley, and the size is known to a percent long before its end.
+FTOL_FIRST = 1e-4
 # Relative change of the sd of a sample after which no other fit is worth it.
 SAME = 0.02
 
@@ -44,19 +47,19 @@ def fit(
 
     With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with the variance that
     this adds. Where the means of whole bins are not zero, neighbouring residuals have one cause, and all samples of as many bins as
-    are correlated count as one. ``start`` is the posterior of most of these episodes, from which the search begins. Without episodes
+    are correlated count as one. ``start`` is the posterior of most of these episodes, at whose mode the search begins. Without episodes
     the result is the prior.
     """
     settings, factor = settings or TwinSettings(), twin.prior_factor
     data = [(e.input, measured(twin, e)) for e in episodes if len(e)]
     noise = np.array(list(twin.noise_sd.values()))
-    warm = start is not None and bool(data) and discrepancy
-    e = np.asarray(np.linalg.solve(factor, start.mode) if warm and start else np.zeros(len(factor)), dtype=np.float64)
-    spread = start.spread if warm and start else noise
-    unmodelled = np.zeros(len(noise))
+    e = np.zeros(len(factor)) if start is None else np.asarray(np.linalg.solve(factor, start.mode), dtype=np.float64)
+    # The sd of a sample begins at the noise each time: taken over from fit to fit, mode and sd would follow each other.
+    spread, unmodelled = noise, np.zeros(len(noise))
     for k in range(1 + settings.refits):
         loss = NegativeLogPosterior(twin, data, spread)
-        found = least_squares(loss.values, e, jac=loss.slopes, method="trf", x_scale=1.0, max_nfev=EVALUATIONS, ftol=FTOL, xtol=XTOL)
+        ftol = FTOL if k or not (data and discrepancy) else FTOL_FIRST
+        found = least_squares(loss.values, e, jac=loss.slopes, method="trf", x_scale=1.0, max_nfev=EVALUATIONS, ftol=ftol, xtol=XTOL)
         e = np.asarray(found.x, dtype=np.float64)
         if not (data and discrepancy):
             break
