@@ -10,7 +10,7 @@ from chargetune.episode.score import Score
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from toy_loop import Told  # noqa: E402 - importable from here on
+from toy_loop import Told
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from chargetune.learning.candidates import Proposal
 from chargetune.learning.safe_mode import safe_thetas
 from chargetune.learning.twin.calibration import SCALES, PredictionCheck
 from chargetune.learning.twin.ensemble import condition
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -77,23 +78,21 @@ def test_a_trial_without_a_trace_teaches_nothing_and_the_start_is_proposed_again
     np.testing.assert_array_equal(declared.ask(SPACE, lost), [(2.0, 2.0, 2.0)])
 
 
-def test_a_safe_batch_is_of_thetas_that_all_passed():
-    trials = Plant().learn(SAFE, 2)
-    batch = SAFE.ask(SPACE, trials, 3)
-    assert len(np.unique(batch, axis=0)) > 1
-    ensemble = condition(SAFE.loop, trials)
-    for theta in batch:
-        # Other plants than those it was chosen by: three standard errors of a share of 200 below 0.95.
-        assert ensemble.predict(theta, 12345, 200).probability() >= 0.95 - 3 * (0.95 * 0.05 / 200) ** 0.5
+def test_a_safe_batch_is_of_thetas_that_all_passed_and_what_runs_is_not_tried_twice(monkeypatch):
+    """Candidates of the search at these levels, of which 1.2 breaks the limit."""
+    trials = [Plant().trial(0, SPACE.upper)]
+    monkeypatch.setattr(Proposal, "search", lambda self: ([self.candidate(np.full(3, v)) for v in (1.2, 1.8, 1.9, 2.0)], None))
+    np.testing.assert_allclose(SAFE.ask(SPACE, trials, 2)[:, 0], [1.8, 1.9])
+    np.testing.assert_allclose(SAFE.ask(SPACE, trials, 4)[:, 0], [1.8, 1.9, 2.0, 1.8])
+    running = Told(1, (1.8,) * 3, "running")
+    np.testing.assert_allclose(SAFE.ask(SPACE, [*trials, running], 2)[:, 0], [1.9, 2.0])
 
 
-def test_what_runs_is_not_proposed_again_and_says_nothing():
+def test_what_is_proposed_is_safe_on_plants_that_nothing_was_chosen_by():
     trials = Plant().learn(SAFE, 2)
-    first = SAFE.ask(SPACE, trials)[0]
-    running = Told(2, tuple(first), "running")
-    beside = SAFE.ask(SPACE, [*trials, running])
-    assert not np.array_equal(beside[0], first)
-    np.testing.assert_array_equal(SAFE.ask(SPACE, [*trials, running]), beside)
+    # Three standard errors of a share of 200 below 0.95.
+    predicted = condition(SAFE.loop, trials).predict(SAFE.ask(SPACE, trials)[0], 12345, 200)
+    assert predicted.probability() >= 0.95 - 3 * (0.95 * 0.05 / 200) ** 0.5
 
 
 def test_a_spent_budget_stops_the_study():
@@ -105,9 +104,9 @@ def test_a_spent_budget_stops_the_study():
     assert np.all(np.isfinite(replace(SAFE, safety=Safety(budget=1.1 * spent)).ask(SPACE, broken)))
 
 
-def after_one_trial(level=2.5, **changes):
+def after_one_trial(level=2.5, **settings):
     trials = [Plant().trial(0, np.full(3, level))]
-    return Proposal(SPACE, condition(ToyLoop(), trials), trials, 0.95, 0), np.full(3, level)
+    return Proposal(SPACE, condition(ToyLoop(), trials, TwinSettings(**settings)), trials, 0.95, 0), np.full(3, level)
 
 
 def test_the_longest_part_of_the_way_that_is_safe_is_gone():
@@ -135,8 +134,8 @@ def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch
 
 
 def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_said(monkeypatch):
-    proposal, theta = after_one_trial()
-    monkeypatch.setattr(Proposal, "search", lambda self: ([], self.candidate(np.full(3, -40.0))))
+    proposal, theta = after_one_trial(steps_back=(0.99,))
+    monkeypatch.setattr(Proposal, "search", lambda self: ([], self.candidate(np.full(3, 0.3))))
     with pytest.warns(RuntimeWarning, match="no safe improvement is known"):
         np.testing.assert_array_equal(safe_thetas(proposal, Safety()), [theta])
 
@@ -165,7 +164,7 @@ def test_more_certainty_costs_objective():
     ensemble = condition(ToyLoop(), trials)
     best = []
     for probability in (0.5, 0.95):
-        (theta, predicted), *_ = Proposal(SPACE, ensemble, trials, probability, 0).search()[0]
+        (_theta, predicted), *_ = Proposal(SPACE, ensemble, trials, probability, 0).search()[0]
         assert predicted.probability() >= probability
         best.append(predicted.objective())
     assert best[0] > best[1]
@@ -204,7 +203,7 @@ def test_errors_beyond_every_scale_are_said():
 
 def test_trials_of_another_plant_are_refused():
     with pytest.raises(ValueError, match="trials of earlier studies"):
-        SAFE.ask(SPACE, [Plant().trial(-1, SPACE.upper)])
+        SAFE.ask(SPACE, [replace(Plant().trial(0, SPACE.upper), number=-1)])
 
 
 def test_an_unknown_start_is_learnt_safely():

@@ -110,7 +110,9 @@ def test_on_a_true_plant_it_finds_what_differential_evolution_finds(extra):
     def cost(points):
         """Of all points (3, n) at once: the objective is the mean of what is missing of the level."""
         loss, n = np.multiply(plant.factors, LOSS), points.shape[1]
-        inflow, levels, _, *gauges = fill(VESSEL.lower + points.T * (VESSEL.upper - VESSEL.lower), np.tile(loss, (n, 1)), np.full(n, plant.gain))
+        inflow, levels, _, *gauges = fill(
+            VESSEL.lower + points.T * (VESSEL.upper - VESSEL.lower), np.tile(loss, (n, 1)), np.full(n, plant.gain)
+        )
         if extra:
             gauges = [gauge + extra(levels[:, s], inflow) for gauge, s in zip(gauges, (slice(0, -1), slice(1, None)), strict=True)]
         over = np.max(gauges, axis=(0, 2)) - LIMIT - TOLERANCE_OF_GAUGE

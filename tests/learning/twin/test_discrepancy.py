@@ -107,7 +107,7 @@ def test_a_feature_that_the_twin_predicts_is_taken_from_it_where_it_was_not_meas
 
 def test_the_mean_is_that_of_textbook_algebra():
     """K W' (W K W' + N)^-1 r for the residuals r of the mode, with the nodes' covariance K that the process states."""
-    ensemble, trials = conditioned((3.0, 1.7))
+    ensemble, _trials = conditioned((3.0, 1.7))
     found = ensemble.discrepancy
     mode, data, (prior,) = found.posterior.mode, found.data, found._priors
     left = found._residuals(mode)[:, 0]

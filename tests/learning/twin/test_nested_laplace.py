@@ -149,7 +149,9 @@ def test_draws_are_reproducible_and_as_many_as_the_shares_say():
     loss, mode = Bent(), np.zeros(3)
     shares = [one.share for one in nested_laplace(loss, mode, laplace(loss, mode), [0])]
     # Each component is a point, which says of a draw which one it is of.
-    parts = tuple((share, Posterior(None, np.full(3, float(k)), np.zeros((3, 3)), np.zeros(1), np.ones(1))) for k, share in enumerate(shares))
+    parts = tuple(
+        (share, Posterior(None, np.full(3, float(k)), np.zeros((3, 3)), np.zeros(1), np.ones(1))) for k, share in enumerate(shares)
+    )
     posterior = Posterior(None, mode, np.eye(3), np.zeros(1), np.ones(1), parts)
     drawn = [posterior.draw(200, seed)[:, 0].astype(int).tolist() for seed in (1, 1, 2)]
     assert drawn[0] == drawn[1] != drawn[2]

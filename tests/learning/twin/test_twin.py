@@ -1,5 +1,6 @@
 """The twin against another simulation, finite differences, dense algebra and known plants."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -160,7 +161,7 @@ def test_means_over_bins_are_those_of_a_loop():
     values[4:9, :, 1] = np.nan
     means, counts = binned_residuals(values, 5)
     edges = np.cumsum([0, 5, 5, 5, 4, 4])
-    for k, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):
+    for k, (low, high) in enumerate(itertools.pairwise(edges)):
         for i in range(3):
             seen = values[low:high, :, i][np.isfinite(values[low:high, :, i])]
             assert counts[k, i] == len(seen)
@@ -188,7 +189,9 @@ def test_a_twin_remembers_nothing_that_learning_does():
     """It is data: what it holds before and after a fit and roll-outs is the same but for what follows from its own fields."""
     twin = ToyLoop().twin
     names = ("sizes", "content", "factors", "prior_factor")
-    before = {name: np.array(getattr(twin, name), dtype=object, copy=True) for name in names if name != "content"} | {"content": repr(twin.content)}
+    before = {name: np.array(getattr(twin, name), dtype=object, copy=True) for name in names if name != "content"} | {
+        "content": repr(twin.content)
+    }
     held = set(vars(twin))
     posterior = fit(twin, [Plant().episode(SPACE.upper, 0)])
     predict(twin, posterior.mode, Plant().episode(SPACE.upper, 0).input)
