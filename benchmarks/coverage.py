@@ -2,7 +2,7 @@
 
 python benchmarks/coverage.py --plant ecm|unknown|structural --study r0 --seeds 0:10
 
-The ensemble is the one by which safe mode chooses the next trial. Two trials are predicted_before by it, noise of the sensor included: that
+The ensemble is the one by which safe mode chooses the next trial. Two trials are predicted by it, noise of the sensor included: that
 next one, and one whose theta is midway between theta_0 and the upper bounds. Printed are the means over the seeds, the lowest seed
 in brackets.
 """
@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from chargetune.episode.episode import Episode
-from chargetune.learning.safe_mode import SURE, SURE_UNPROVED
 from chargetune.learning.twin.ensemble import Ensemble, condition
+from chargetune.learning.twin.settings import TwinSettings
 from learning import METHODS
 
 TRIALS, PLANTS_DRAWN, NOISE_V, STATED = 3, 96, 2e-3, 0.9
@@ -31,7 +31,7 @@ TRIALS, PLANTS_DRAWN, NOISE_V, STATED = 3, 96, 2e-3, 0.9
 
 def share(ensemble: Ensemble, episode: Episode, seed: int) -> float:
     """Of the noisy samples of the voltage, the share within the stated intervals."""
-    replayed = ensemble.replayed(episode, PLANTS_DRAWN, seed).episodes
+    replayed = ensemble.replayed(episode, seed).episodes
     drawn = np.array([np.stack(e.signal("voltage_V"), axis=1) for e in replayed if e is not None])
     drawn = drawn + NOISE_V * np.random.default_rng(seed).standard_normal(drawn.shape)
     low, high = np.quantile(drawn, [(1 - STATED) / 2, (1 + STATED) / 2], axis=0)
@@ -52,7 +52,7 @@ def study(plant: str, name: str, seed: int) -> list[list[float]]:
             theta = tuner.ask(problem.space, told, 1)[0]
             score, episode, ending = problem(theta, 1000 * seed + k)
             if told:
-                ensemble = condition(tuner.loop, told, SURE, SURE_UNPROVED)
+                ensemble = condition(tuner.loop, told, TwinSettings(plants=PLANTS_DRAWN))
                 other = problem(afar, 1000 * seed + 500 + k)[1]
                 out.append([share(ensemble, e, seed) for e in (episode, other)])
             status = "done" if score else "failed"

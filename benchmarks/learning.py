@@ -6,8 +6,8 @@ A row is one method after one number of trials. Solved: the true, noise-free exc
 is at most 1 mV, any other limit kept within its tolerance, and its t95 within 1.05 of the attainable one. Recommended is the
 best that is believed to keep the limits by twin and composite (their `best`), the newest theta by safe and ilc, the best
 that kept the limits as measured by the others. Safe is told this tolerance, the others half of it.
-Attainable: the least t95 with at most 0.5 mV over the limit (1 mV where no theta has less) that envelope steps and the search on the
-true plant find, computed here and kept in --cache; on a DFN plant envelope steps alone, and t80 stands for t95 in every key. Where no
+Attainable: the least t95 with at most 0.5 mV over the limit (1 mV where no theta has less) that searches on the true plant from
+several starts find, computed here and kept in --cache; on a DFN plant t80 stands for t95 in every key. Where no
 theta keeps the limit, nothing is solved. A safe learner that knows no safe theta stops. ask_s is wall time, for which --workers 1
 leaves both cores to the learner.
 """
@@ -40,9 +40,12 @@ from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.initial_design import sobol_points
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.study.result import measured_result
 
 WITHIN, EXCESS_MV, FAR_MV = 1.05, 1.0, 5.0
+# Share of the objective that an iteration towards the attainable optimum has to win.
+GAIN = 1e-5
 NEWEST, BELIEVED = ("safe", "ilc"), ("twin", "composite")
 # Who promises to keep a limit is told the tolerance that it is judged by, the others half of it.
 PROMISING, SHARE_TOLD = ("safe",), 0.5
@@ -87,11 +90,6 @@ def _attainable_t95(plant: str, study: str, seed: int, bound_V: float) -> float:
     best, mark = [float("inf")], _mark(plant)
 
     class Truth:
-        controller = problem.controller
-
-        def measured_rows(self, episode: Any) -> Any:
-            return problem.measured_rows(episode) - bound_V
-
         def samples(self, episode: Any) -> Any:
             return problem.samples(episode)
 
@@ -101,19 +99,17 @@ def _attainable_t95(plant: str, study: str, seed: int, bound_V: float) -> float:
                 best[0] = min(best[0], score.metrics[mark])
             return score
 
-    search = Search(Truth(), lambda thetas: [problem.episode(theta) for theta in thetas], problem.space, share=1.0)  # type: ignore[arg-type]
+    search = Search(Truth(), lambda thetas: [problem.episode(theta) for theta in thetas], problem.space, share=1.0)
     space = problem.space
     first = [space.to_unit(space.default), np.full(space.dimension, 0.9)]
     if plant in DFN:
+        # Their episodes take minutes together, and there are no cheap ones to choose starts by.
         for start in first:
-            search.envelope(start, 8)
+            search.refine(start, 8, GAIN)
         return best[0]
     pool = [*first, *sobol_points(space.dimension, 0, 0, 64)]
-    for start in first:
-        search.envelope(start, 8)
-    for start in (search.best(), *sorted(pool, key=search.merit)[:3]):
-        search.refine(start, 60)
-    search.refine(search.best(), 60)
+    found = [search.refine(start, 60, GAIN) for start in (*first, *sorted(pool, key=search.merit)[:3])]
+    search.refine(min(found, key=search.merit), 60, GAIN / 10)
     return best[0]
 
 
@@ -121,14 +117,15 @@ def _mark(plant: str) -> str:
     return "t80_min" if plant in DFN else "t95_min"
 
 
-def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int]) -> dict[str, Any]:
-    """True excess and t95 of every trial of one method on one seed."""
+def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int], settings: TwinSettings | None = None) -> dict[str, Any]:
+    """True excess and t95 of every trial of one method on one seed; of a twin with other ``settings`` where they are given."""
     method, seed = job
     problem = make_problem(plant, study, seed, noise_V)
     truth = exact(problem)
     if method not in PROMISING:
         problem = replace(problem, tolerance_V=SHARE_TOLD * problem.tolerance_V)
     tuner = METHODS[method](problem, seed)
+    tuner = tuner if settings is None else replace(tuner, settings=settings)
     told: list[Any] = []
     names = ("excess_mV", "excess_K", "excess_anode_mV", "kept", "t95", "ask_s", "recommended")
     out: dict[str, Any] = {"method": method, "seed": seed, **{name: [] for name in names}}

@@ -1,7 +1,6 @@
 """Trials for the tests of tuners."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,7 @@ from chargetune.episode.score import Score
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-
-@dataclass(frozen=True)
-class Told:
-    """As much of a trial as a tuner reads."""
-
-    number: int
-    theta: tuple
-    status: str
-    score: Score | None
+from toy_loop import Told
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from chargetune.learning.twin.settings import TwinSettings
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 KEYS = {
     "method", "plant", "study", "noise_mV", "trials", "solved", "of", "t95_ratio_median", "t95_ratio_worst",
@@ -61,8 +63,11 @@ def test_a_short_run_and_its_figure(tmp_path, run_here):
     assert "unknown ['guess'], allowed are" in said
 
 
-def test_every_part_that_is_taken_away_is_one(run_here):
+def test_every_part_that_is_taken_away_is_a_setting(run_here):
     parts = runpy.run_path(str(BENCHMARKS / "ablation.py"))["PARTS"]
-    assert all(hasattr(owner, name) for part in parts.values() for owner, name, _ in part)
+    usual = TwinSettings()
+    assert parts["nothing"] == {}
+    for name, changes in parts.items():
+        assert name == "nothing" or TwinSettings(**changes) != usual
     said, _ = run_here("ablation.py", "--methods", "guess")
-    assert "unknown ['guess'], allowed are nothing, discrepancy" in said
+    assert "unknown ['guess'], allowed are nothing, its scale" in said

@@ -4,15 +4,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-import pytest
+from toy_loop import SPACE as TOY
+from toy_loop import Plant, ToyLoop
 
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning import Composite, IterativeLearning, Safety, TwinTuner
-from chargetune.learning.twin.ensemble import condition
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.plants.sensors import Sensors
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
@@ -22,10 +22,19 @@ PROBLEM = ChargingProblem(
     default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0, scale=True),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
     soc_start=0.7, steps=24, verdict_samples=3,
 )  # fmt: skip
+FEW = TwinSettings(plants=16, judges=32, scales=4, rounds=3)
+
+
+def filled(theta, seed):
+    """A trial of the toy."""
+    episode = Plant().episode(theta, seed)
+    return ToyLoop().score(episode), episode, episode.ending.value
+
+
 # By tuner the trials of the whole study, and how many there are when it is interrupted: enough that it has learnt.
 TUNERS = {
-    "twin": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, pool=4, steps=2, iterations=3), 4, 2),
-    "safe": (lambda: TwinTuner(ChargingTwin(PROBLEM), seed=2, safety=Safety()), 4, 2),
+    "twin": (lambda: TwinTuner(ToyLoop(), seed=2, settings=FEW), 4, 2),
+    "safe": (lambda: TwinTuner(ToyLoop(), seed=2, safety=Safety(), settings=FEW), 4, 2),
     "composite": (lambda: Composite(ChargingWindows(PROBLEM), seed=2, n_initial=2), 6, 4),
     "envelope": (lambda: IterativeLearning(ChargingTwin(PROBLEM)), 5, 2),
 }
@@ -33,51 +42,26 @@ TUNERS = {
 
 def go_on(path, name, count):
     """Run the study ``name`` up to ``count`` trials with a tuner of its own; its thetas and traces."""
+    toy = name in ("twin", "safe")
     with (
         Store(path) as store,
-        Study.create_or_resume(store, name, config={}, space=PROBLEM.space, tuner=TUNERS[name][0](), seed=5) as study,
+        Study.create_or_resume(store, name, config={}, space=TOY if toy else PROBLEM.space, tuner=TUNERS[name][0](), seed=5) as study,
     ):
-        study.run(PROBLEM, count)
+        study.run(filled if toy else PROBLEM, count)
         return [(t.theta, t.trace_sha256) for t in study.trials()]
 
 
-@pytest.mark.parametrize("name", TUNERS)
-def test_a_study_that_was_interrupted_ends_as_one_that_was_not(name, tmp_path, monkeypatch):
+def test_a_study_that_was_interrupted_ends_as_one_that_was_not(tmp_path, monkeypatch):
+    """Of every tuner, all in one other process: it takes longer to start than to learn."""
     monkeypatch.setenv("CHARGETUNE_CC", "none")
-    _, whole, part = TUNERS[name]
-    uninterrupted = go_on(tmp_path / "whole.db", name, whole)
-    assert go_on(tmp_path / "part.db", name, part) == uninterrupted[:part]
-    code = f"import sys; sys.path.insert(0, sys.argv[1]); from test_resume import go_on; go_on(sys.argv[2], {name!r}, {whole})"
+    uninterrupted = {name: go_on(tmp_path / "whole.db", name, whole) for name, (_, whole, _) in TUNERS.items()}
+    for name, (_, _, part) in TUNERS.items():
+        assert go_on(tmp_path / "part.db", name, part) == uninterrupted[name][:part]
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from test_resume import *; [go_on(sys.argv[2], n, t[1]) for n, t in TUNERS.items()]"
+    )
     subprocess.run([sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "part.db")], check=True)
-    assert go_on(tmp_path / "part.db", name, whole) == uninterrupted
-    # It learns: not all trials are one.
-    assert len({theta for theta, _ in uninterrupted}) > 1
-
-
-@pytest.mark.usefixtures("virtual_machine")
-def test_what_a_twin_remembers_changes_nothing_that_it_says():
-    """After more trials than it learns from, and after another study's have gone through the same twin."""
-    trials = []
-    for number, level in enumerate((4.0, 2.5, 2.0, 1.7, 1.6, 1.5)):
-        score, episode, _ = PROBLEM(np.array([level]), number)
-        trials.append(Told(number, (level,), score, episode))
-    used = ChargingTwin(PROBLEM)
-    for n in (1, 2, 3, 4, 5, 6):
-        condition(used, trials[:n])
-    condition(used, trials[::-1])
-    for known in (trials[:2], trials):
-        remembered, fresh = (condition(loop, known) for loop in (used, ChargingTwin(PROBLEM)))
-        np.testing.assert_array_equal(remembered.posterior.mode, fresh.posterior.mode)
-        np.testing.assert_array_equal(remembered.posterior.root, fresh.posterior.root)
-        assert (remembered.discrepancy.scale, remembered.standardised_error) == (fresh.discrepancy.scale, fresh.standardised_error)
-        drawn, anew = (one.predict(np.array([1.55]), 4, 3).excess for one in (remembered, fresh))
-        np.testing.assert_array_equal(drawn, anew)
-
-
-class Told:
-    """A trial that is told."""
-
-    status = "done"
-
-    def __init__(self, number, theta, score, episode):
-        self.number, self.theta, self.score, self.episode = number, theta, score, lambda: episode
+    for name, (_, whole, _) in TUNERS.items():
+        assert go_on(tmp_path / "part.db", name, whole) == uninterrupted[name]
+        # It learns: not all trials are one.
+        assert len({theta for theta, _ in uninterrupted[name]}) > 1

@@ -92,9 +92,11 @@ class TwinTuner:
         # What is best on the expected plant is on its way already when a trial is running.
         pending = any(t.status == "running" for t in trials)
         thetas = [] if pending else [self._likely(proposal)]
+        # From one that runs a search may not move at all: what is good enough for one plant is for its neighbour.
+        start = space.to_unit(np.array(next(t.theta for t in reversed(trials) if t.status != "running")))
         for k in range(n - len(thetas)):
             search = Search(self.loop, ensemble.plant(self._seed(trials) + k), space)
-            u = search.refine(space.to_unit(np.array(trials[-1].theta)), 2 * self.settings.iterations, self.settings.gain)
+            u = search.refine(start, 2 * self.settings.iterations, self.settings.gain, proximal=self.settings.proximal)
             thetas.append(space.from_unit(u))
         return np.array(thetas)
 

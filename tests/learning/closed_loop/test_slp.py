@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import linprog, minimize
 
-from chargetune.learning.closed_loop.slp import Linearisation, Point, _Linear, solve_slp
+from chargetune.learning.closed_loop.slp import Linearisation, Point, solve_slp
 
 
 class Counted:
@@ -132,8 +132,48 @@ def test_what_is_broken_by_no_more_than_counts_as_kept_is_no_reason_to_go_on():
 
 def test_a_linear_program_without_a_solution_is_warned_of_and_no_step():
     """From a point outside the cube no short step leads into it."""
-    lines = Linearisation(np.array([1.5]), np.array([0.3, -0.1]), np.ones(1), np.ones((2, 1)))
+    lines = Linearisation(np.array([1.5]), np.array([0.3, -0.1]), np.ones(1), np.ones((2, 1)), 0.0, np.array([1.5]))
     with pytest.warns(RuntimeWarning, match="a linear program of 2 rows failed"):
-        step, left = _Linear().step(lines, 0.15, 1.0)
+        step, left = lines.step(0.15, 1.0)
     np.testing.assert_array_equal(step, [0.0])
     assert left == 0.3
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_with_a_proximal_term_a_linear_problem_is_solved_as_by_another_solver(seed):
+    """min g'u + w |u - centre|_1 s.t. A u <= b, in the variables u+, u- >= 0 with u = centre + u+ - u-."""
+    draw = np.random.default_rng(seed)
+    d, w = 5, 0.05
+    slope, matrix = -draw.uniform(0.0, 0.3, d), draw.uniform(0.0, 1.0, (8, d))
+    centre, most = draw.uniform(0.1, 0.4, d), draw.uniform(1.0, 1.5, 8)
+    found = solve_slp(Counted(lambda u: -1.0 + slope @ (u - centre), lambda u: matrix @ u - most), centre, 60, 1e-9, 0.0, w)
+    split = linprog(
+        np.concatenate([slope + w, w - slope]),
+        A_ub=np.hstack([matrix, -matrix]),
+        b_ub=most - matrix @ centre,
+        bounds=[*((0.0, 1.0 - c) for c in centre), *((0.0, c) for c in centre)],
+    )
+    assert np.max(matrix @ found - most) <= 1e-6
+    assert slope @ (found - centre) + w * np.abs(found - centre).sum() == pytest.approx(split.fun, abs=1e-6)
+
+
+def test_entries_without_influence_stay_at_the_centre_and_return_to_it():
+    """max u_0 - 0.001 u_3 s.t. u_0 <= 0.7: entries 1 and 2 do nothing, entry 3 wins less than the proximal term costs."""
+    problem = Counted(lambda u: -1.0 - u[0] - 1e-3 * u[3], lambda u: [u[0] - 0.7])
+    centre = np.array([0.2, 0.3, 0.9, 0.5])
+    found = solve_slp(problem, np.array([0.4, 0.8, 0.1, 0.2]), 60, 1e-6, 0.0, 0.01, centre)
+    np.testing.assert_allclose(found, [0.7, 0.3, 0.9, 0.5], atol=1e-4)
+    # Without the term nothing says where they belong.
+    free = solve_slp(problem, np.array([0.4, 0.8, 0.1, 0.2]), 60, 1e-6)
+    assert np.max(np.abs(free[1:3] - centre[1:3])) > 0.1
+
+
+@pytest.mark.parametrize("w", [0.05, 0.5])
+def test_a_proximal_term_shrinks_a_parabola_by_the_closed_form(w):
+    """min 1/2 |u - a|^2 + w' |u - c|_1: u_i = c_i + sign(a_i - c_i) max(0, |a_i - c_i| - w')."""
+    a, c = np.array([0.9, 0.45, 0.1]), np.array([0.4, 0.4, 0.5])
+    start = np.array([0.5, 0.5, 0.5])
+    value = lambda u: 1.0 + 0.5 * np.sum((u - a) ** 2)  # noqa: E731
+    found = solve_slp(Counted(value, lambda u: [-1.0]), start, 200, 1e-9, 0.0, w, c)
+    weight = w * value(start)
+    np.testing.assert_allclose(found, c + np.sign(a - c) * np.maximum(0.0, np.abs(a - c) - weight), atol=5e-3)

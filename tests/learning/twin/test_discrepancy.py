@@ -1,240 +1,189 @@
 """What a twin cannot represent: learnt where it was seen, doubted where it was not; and the ensemble's coverage."""
 
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
-from two_pairs import AnotherCell, TwoPairs
+from scipy.linalg import cho_factor, cho_solve
+from toy_loop import NOISE, SPACE, Plant, ToyLoop, holed, structural
 
-from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning.black_box.gaussian_process import SurrogateWarning
-from chargetune.learning.twin.calibration import SCALES, calibrate_scale
-from chargetune.learning.twin.discrepancy import LENGTH, Discrepancy, _fit, _Part
+from chargetune.learning.twin.discrepancy import Discrepancy, _fit, _Part, _part
 from chargetune.learning.twin.ensemble import condition
-from chargetune.plants.sensors import Sensors
+from chargetune.learning.twin.settings import TwinSettings
 
-CELL = default_cell()
-WARM = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1))
+pytestmark = pytest.mark.usefixtures("virtual_machine")
 
-
-def charge(seed=1, *, pairs=False, cell=CELL, **changes):
-    return ChargingProblem(
-        cell, mismatch_seed=seed, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
-        plant_model=TwoPairs(cell) if pairs else None, **changes,
-    )  # fmt: skip
+WRONG = Plant(extra=structural)
+WITH_SWIRL = ToyLoop(noise_sd={"gauge": NOISE, "swirl": NOISE}, discrepancy_sd_floor={"gauge": 1e-3, "swirl": 1e-3})
 
 
-def told(episode):
-    return SimpleNamespace(episode=lambda: episode)
+def conditioned(levels, plant=WRONG, loop=None, seed=0, **settings):
+    """The ensemble after trials with all entries of theta at these levels, and the trials."""
+    trials = [plant.trial(k, np.full(3, level), seed) for k, level in enumerate(levels)]
+    return condition(loop or ToyLoop(), trials, TwinSettings(**settings)), trials
 
 
-def beliefs(problem, ratios):
-    episodes = [problem.episode(np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
-    return condition(ChargingTwin(problem), [told(e) for e in episodes]), episodes
+def drawn_gauges(ensemble, episode):
+    """On the plants of the ensemble at the recorded inputs of an episode, shape (plants, K, 2)."""
+    return np.array([np.stack(e.signal("gauge"), axis=1) for e in ensemble.replayed(episode, 3).episodes])
 
 
-def gap(episode, name, where):
-    """The episode without the samples of one output at ``where``."""
-    column, changed = episode.output_names.index(name), {}
-    for side in ("output_start", "output_end"):
-        changed[side] = getattr(episode, side).copy()
-        changed[side][where, column] = np.nan
-    return replace(episode, **changed)
-
-
-def drawn_voltages(ensemble, episode, count=48):
-    """Voltages at the recorded input of an episode on drawn plants, shape (count, K, 2)."""
-    replayed = ensemble.replayed(episode, count, 3).episodes
-    return np.array([np.stack(e.signal("voltage_V"), axis=1) for e in replayed])
-
-
-@pytest.mark.parametrize("pairs", [False, True], ids=["a circuit", "a plant that the twin cannot be"])
-def test_intervals_cover_the_next_trial(pairs):
-    """90 % intervals of noisy samples of a third theta, after two others, cover 85 to 95 % of them."""
-    covered = []
+@pytest.mark.parametrize("plant", [Plant(), WRONG], ids=["of the model", "structural"])
+def test_intervals_cover_the_next_trial(plant):
+    """90 % intervals of noisy samples of a third theta, after two others, cover at least 85 % of them, and are not vain."""
+    covered, width = [], []
     for seed in range(4):
-        problem = charge(seed, pairs=pairs)
-        ensemble, _ = beliefs(problem, (4.0, 2.0))
-        following = problem.episode(np.full(9, 1.6), 10)
-        voltages = drawn_voltages(ensemble, following)
-        spread = np.sqrt(voltages.var(axis=0) + 0.002**2)
-        measured = np.stack(following.signal("voltage_V"), axis=1)
-        covered.append(np.mean(np.abs(measured - voltages.mean(axis=0)) < 1.645 * spread))
-    assert 0.85 < np.mean(covered) < 0.95
+        ensemble, _ = conditioned((3.0, 2.0), plant, seed=seed)
+        following = plant.episode(np.full(3, 1.6), 1000 + seed)
+        gauges = drawn_gauges(ensemble, following)
+        spread = np.sqrt(gauges.var(axis=0) + NOISE**2)
+        off = np.stack(following.signal("gauge"), axis=1) - gauges.mean(axis=0)
+        covered.append(np.mean(np.abs(off) < 1.645 * spread))
+        width.append(np.mean(spread))
+    assert np.mean(covered) > 0.85
+    assert np.mean(width) < 6 * NOISE
 
 
 def test_what_was_measured_is_reproduced_by_every_drawn_plant():
-    ensemble, episodes = beliefs(charge(pairs=True), (4.0, 1.6))
-    true = np.stack(episodes[-1].signal("voltage_V", true=True), axis=1)
-    off = np.sqrt(np.mean((drawn_voltages(ensemble, episodes[-1], 8) - true) ** 2, axis=(1, 2)))
-    assert np.max(off) < 3.5e-3
+    ensemble, trials = conditioned((3.0, 1.6))
+    true = np.stack(WRONG.episode(np.full(3, 1.6)).signal("gauge"), axis=1)
+    off = np.sqrt(np.mean((drawn_gauges(ensemble, trials[-1].episode()) - true) ** 2, axis=(1, 2)))
+    assert np.max(off) < 3 * NOISE
 
 
 def test_a_sample_is_surer_where_something_was_measured():
-    ensemble, episodes = beliefs(charge(pairs=True), (4.0,))
-    near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(ensemble, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    ensemble, trials = conditioned((3.0,))
+    near = drawn_gauges(ensemble, trials[0].episode()).std(axis=0).mean()
+    far = drawn_gauges(ensemble, WRONG.episode(np.full(3, 1.3), 5)).std(axis=0).mean()
     assert far > 3 * near
 
 
-def test_between_the_nodes_of_a_coarse_table_a_sample_is_as_sure():
-    """With three features the nodes are far from what was measured, and every sampled plant has to pass through it all the same."""
-    ensemble, episodes = beliefs(charge(pairs=True, cell=WARM), (4.0,))
-    near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(ensemble, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
-    assert len(ensemble.loop.features) == 3
-    assert far > 20 * near
-
-
 def test_the_error_of_a_state_does_not_jump_with_the_input():
-    ensemble, _ = beliefs(charge(pairs=True, cell=WARM), (4.0,))
-    tables = {
-        name: table.reshape(ensemble.discrepancy.lookup_table.counts)
-        for name, table in zip(
-            ensemble.discrepancy.lookup_table.outputs, ensemble.discrepancy.error(ensemble.posterior.mode, 3).table, strict=True
-        )
-    }
+    ensemble, _ = conditioned((3.0, 2.0), loop=WITH_SWIRL)
+    found = ensemble.discrepancy
+    (sample,) = found.samples(found.posterior.mode[None], [1.0], [3])
+    tables = dict(zip(found.lookup_table.outputs, (t.reshape(found.lookup_table.counts) for t in sample.table), strict=True))
     steps = {name: np.max(np.abs(np.diff(table, axis=1))) for name, table in tables.items()}
-    assert steps["temperature_K"] < 1e-3 * np.ptp(tables["temperature_K"])
-    assert steps["voltage_V"] > 0.1 * np.ptp(tables["voltage_V"])
+    assert steps["swirl"] < 1e-2 * np.ptp(tables["swirl"])
+    assert steps["gauge"] > 0.05 * np.ptp(tables["gauge"])
 
 
-def test_a_temperature_at_its_limit_is_foretold():
-    """The cell heats faster and cools better than its model, and its temperature was held at the limit once."""
-    other = replace(CELL, thermal=Thermal(heat_capacity_J_K=38.0, cooling_W_K=0.13))
-    problem = charge(pairs=False, cell=WARM, temperature_max_K=302.0, steps=240)
-    problem = replace(problem, plant_model=AnotherCell(other))
-    ensemble, episodes = beliefs(problem, (1.0,))
-    highest = np.max(episodes[0].signal("temperature_K")[1])
-    assert abs(highest - 302.0) < 0.1
-    drawn = ensemble.predict(np.full(9, 1.0), 16, 0).episodes
-    np.testing.assert_allclose([np.max(e.signal("temperature_K")[1]) for e in drawn], highest, rtol=0, atol=0.05)
+@pytest.mark.parametrize("where", [slice(20, 40), slice(None)], ids=["for a while", "never"])
+def test_a_gap_in_an_output_is_bridged(where):
+    """A sensor that fails for a third of a trial, or for all of it, beside another that goes on."""
+    trial = WRONG.trial(0, SPACE.upper)
+    lost = replace(trial, episode=lambda: holed(trial.episode(), "swirl", where))
+    mean = condition(WITH_SWIRL, [lost]).discrepancy
+    filled = mean.mean(mean.posterior.mode)(trial.episode())
+    assert np.all(np.isfinite(filled.output_end))
 
 
-@pytest.mark.parametrize(("name", "seen"), [("temperature_K", True), ("temperature_K", False), ("soc", True)])
-def test_a_gap_in_a_feature_is_bridged(name, seen):
-    """A sensor that fails for a third of a trial, or for all of it where the twin predicts what it measures."""
-    problem = charge(cell=WARM)
-    episode = problem.episode(np.full(9, 4.0), 0)
-    holed = gap(episode, name, slice(100, 200) if seen else slice(None))
-    whole, bridged = (
-        Discrepancy(condition(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
-    )
-    off = np.abs(bridged.signals(holed) - whole.signals(episode)) / [1.0, 6.0, 35.0]
-    assert np.max(off) < 0.05
-    assert np.all(np.isfinite(bridged.error(bridged.posterior.mode)(holed).signal("voltage_V")[1]))
+def test_a_gap_in_a_feature_lies_between_its_neighbours_and_one_that_was_never_measured_is_named():
+    trial = WRONG.trial(0, SPACE.upper)
+    found = condition(ToyLoop(), [trial]).discrepancy
+    bridged = found.signals(holed(trial.episode(), "level", slice(20, 30)))
+    np.testing.assert_allclose(bridged, found.signals(trial.episode()), atol=0.02)
+    never = holed(trial.episode(), "level", slice(None))
+    with pytest.raises(ValueError, match="level was never measured in an episode of 60"):
+        found.signals(never)
 
 
-def test_a_feature_that_was_never_measured_is_named():
-    problem = charge(cell=WARM)
-    holed = gap(problem.episode(np.full(9, 4.0), 0), "soc", slice(None))
-    with pytest.raises(ValueError, match="soc was never measured in an episode of"):
-        condition(ChargingTwin(problem), [told(holed)] * 2)
+def test_a_feature_that_the_twin_predicts_is_taken_from_it_where_it_was_not_measured():
+    @dataclass(frozen=True)
+    class Swirling(ToyLoop):
+        @property
+        def features(self):
+            return {"level": (0.0, 1.0), "inflow": (0.0, 1.0), "swirl": (0.0, 0.2)}
+
+    loop = Swirling(noise_sd=WITH_SWIRL.noise_sd, discrepancy_sd_floor=WITH_SWIRL.discrepancy_sd_floor)
+    trials = [Plant().trial(k, SPACE.upper) for k in range(1)]
+    found = condition(loop, trials).discrepancy
+    episode = trials[0].episode()
+    predicted = found.signals(holed(episode, "swirl", slice(None)))
+    np.testing.assert_allclose(predicted, found.signals(episode), atol=5 * NOISE)
 
 
-def test_the_scale_grows_with_what_was_not_foretold():
-    scales = []
-    for pairs in (False, True):
-        problem = charge(pairs=pairs)
-        before, _ = beliefs(problem, (4.0,))
-        scales.append(calibrate_scale([before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))]))
-    assert scales[0] < 2.0 < scales[1]
+def test_the_mean_is_that_of_textbook_algebra():
+    """K W' (W K W' + N)^-1 r for the residuals r of the mode, with the nodes' covariance K that the process states."""
+    ensemble, _trials = conditioned((3.0, 1.7))
+    found = ensemble.discrepancy
+    mode, data, (prior,) = found.posterior.mode, found.data, found._priors
+    left = found._residuals(mode)[:, 0]
+    expected = prior @ data.weights.T @ np.linalg.solve(data.weights @ prior @ data.weights.T + np.diag(data.variance[:, 0]), left)
+    np.testing.assert_allclose(found.mean(mode).table[0], expected, atol=1e-3 * np.abs(expected).max())
 
 
-def test_a_repeat_says_nothing_of_elsewhere():
-    """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
-    problem = charge(pairs=True)
-    before, _ = beliefs(problem, (4.0, 1.6))
-    predicted_before = before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))
-    assert predicted_before.standardised_error < 1.0
-    for sure in (0.5, 0.84):
-        # ln s ~ N(0, 1) as before: its quantile, on a grid of 8 %.
-        assert calibrate_scale([predicted_before], sure) == pytest.approx(np.exp(norm.ppf(sure)), rel=0.1)
+@pytest.mark.parametrize("scale", [0.1, 1.0, 6.3])
+def test_samples_have_the_mean_and_the_covariance_of_the_process_of_their_scale(scale):
+    """Monte Carlo of 600 samples, against the covariance that is built and factorised directly."""
+    ensemble, _ = conditioned((3.0, 1.7))
+    found = ensemble.discrepancy
+    prior, data, mode = scale**2 * found._priors[0], found.data, found.posterior.mode
+    seen = cho_factor(data.weights @ prior @ data.weights.T + np.diag(data.variance[:, 0]))
+    gain = cho_solve(seen, data.weights @ prior).T
+    weights = found.lookup_table.weights(found.at(WRONG.episode(np.full(3, 1.3), 1)))
+    covariance = weights @ (prior - gain @ data.weights @ prior) @ weights.T
+    mean = weights @ gain @ found._residuals(mode)[:, 0]
+    drawn = np.array([s.table[0] @ weights.T for s in found.samples(np.tile(mode, (600, 1)), [scale] * 600, range(600))])
+    sd = np.sqrt(np.diag(covariance))
+    assert np.max(np.abs(drawn.mean(axis=0) - mean) / sd) < 5 / np.sqrt(600)
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.25 * sd.max() ** 2)
+    np.testing.assert_allclose(np.trace(np.cov(drawn.T)), np.trace(covariance), rtol=0.2)
 
 
-def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
-    """The second trial says that the errors are larger than stated; four repeats of it change that little."""
-    problem = charge(pairs=True)
-    ratios = (4.0, 1.6, 1.6, 1.6, 1.6, 1.6)
-    trials = [told(problem.episode(np.full(9, ratio), seed)) for seed, ratio in enumerate(ratios)]
-    loop = ChargingTwin(problem)
-    scales = [condition(loop, trials[:n]).discrepancy.scale for n in (2, 6)]
-    assert scales[0] > 2.0
-    assert scales[1] > 0.7 * scales[0]
+def test_samples_of_several_scales_are_those_of_one_after_the_other():
+    found = conditioned((3.0, 1.7))[0].discrepancy
+    unknowns = found.posterior.draw(4, 0)
+    together = found.samples(unknowns, [1.0, 2.0, 1.0, 0.5], [7, 8, 9, 10])
+    for m, scale, seed, one in zip(unknowns, [1.0, 2.0, 1.0, 0.5], [7, 8, 9, 10], together, strict=True):
+        (alone,) = found.samples(m[None], [scale], [seed])
+        np.testing.assert_allclose(one.table, alone.table, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_variances_of_every_scale_are_those_of_directly_built_covariances(seed):
+    draw = np.random.default_rng(seed)
+    nodes, count, ahead = 12, 7, 9
+    half = draw.standard_normal((nodes, nodes))
+    prior = half @ half.T / nodes + 0.1 * np.eye(nodes)
+    weights, other = (draw.dirichlet(np.ones(nodes), n) for n in (count, ahead))
+    variance = draw.uniform(0.01, 0.2, count)
+    scales = np.array([0.1, 0.7, 1.0, 3.0, 10.0])
+    found = _part(prior, variance, weights).variances(other, scales)
+    for scale, own in zip(scales, found, strict=True):
+        k = scale**2 * prior
+        seen = cho_factor(weights @ k @ weights.T + np.diag(variance))
+        expected = np.diag(other @ (k - k @ weights.T @ cho_solve(seen, weights @ k)) @ other.T)
+        np.testing.assert_allclose(own, expected, rtol=1e-5)
+        # And those of the part that samples of this scale are drawn by.
+        part = _part(k, variance, weights)
+        np.testing.assert_allclose(np.sum((other @ part.root) ** 2, axis=1), expected, rtol=1e-5)
 
 
 def test_a_factor_of_a_covariance_that_rounding_left_indefinite():
     """What the data take away is a little more than there is: of 2 by 2, the eigenvalues 2 and -1e-6."""
     taken = np.array([[1e-6, 0.0], [0.0, 1e-6]])
-    root = _Part(taken, np.ones((2, 2)), np.eye(2)).root
+    root = _Part(taken, np.ones((2, 2)), np.eye(2), np.ones(2), np.eye(2)).root
     np.testing.assert_allclose(root @ root.T, np.ones((2, 2)), atol=2e-6)
 
 
-@pytest.mark.usefixtures("virtual_machine")
-def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
-    problem = charge(steps=60)
-    trials = [told(problem.episode(np.full(9, ratio), seed)) for seed, ratio in enumerate((4.0, 2.0, 1.6))]
-    loop = ChargingTwin(problem)
-    fits = []
-    for n in (2, 3, 3):
-        ensemble = condition(loop, trials[:n])
-        fits.append(len(loop.twin.predicted_before))
-    assert fits == [1, 2, 2]
-    assert len(loop.twin.ways) == 3
-    assert len(loop.twin.newest) == 1
-    fresh = condition(ChargingTwin(problem), trials)
-    assert fresh.discrepancy.scale == ensemble.discrepancy.scale
-    assert fresh.standardised_error == ensemble.standardised_error
-    np.testing.assert_array_equal(fresh.posterior.mode, ensemble.posterior.mode)
-
-
-@pytest.mark.usefixtures("virtual_machine")
-def test_before_a_trial_was_foretold_errors_may_be_as_large_as_the_prior_of_the_scale_says():
-    problem = charge(steps=60)
-    trials = [told(problem.episode(np.full(9, 4.0), 1))]
-    scales = [condition(ChargingTwin(problem), trials, sure).discrepancy.scale for sure in (0.5, 0.84)]
-    # The quantiles of exp(N(0, 1)) on a grid of 8 %.
-    np.testing.assert_allclose(scales, [1.0, np.exp(norm.ppf(0.84))], rtol=0.08)
-
-
-@pytest.mark.usefixtures("virtual_machine")
-def test_features_are_one_to_three():
-    ensemble, episodes = beliefs(charge(steps=60), (4.0,))
+def test_features_are_one_to_as_many_as_have_a_length_scale():
+    ensemble, trials = conditioned((3.0,))
     with pytest.raises(ValueError, match="allowed are 1 to 3"):
-        Discrepancy(ensemble.posterior, tuple(episodes), {})
-
-
-@pytest.mark.usefixtures("virtual_machine")
-@pytest.mark.parametrize("scale", [0.1, 1.0, 6.3])
-def test_the_scale_is_inferred_of_what_it_is_applied_to(scale):
-    """The variance that a scale is judged by is that of drawn errors with this scale: Monte Carlo, and through the table."""
-    problem = charge(pairs=True, steps=90)
-    ensemble, _ = beliefs(problem, (4.0,))
-    episode = problem.episode(np.full(9, 1.6), 5)
-    k = int(np.argmin(np.abs(SCALES - scale)))
-    scaled = ensemble.discrepancy.scaled(1.0).scaled(SCALES[k])
-    judged = ensemble.discrepancy.scaled(1.0)._off(episode).unmodelled[k, :, 0]
-    weights = scaled.lookup_table.weights(scaled._at(episode))
-    np.testing.assert_allclose(judged, scaled._parts[0].variance(weights), rtol=1e-6, atol=1e-14)
-    drawn = np.array([error.table[0] @ weights.T for error in scaled.errors(np.tile(ensemble.posterior.mode, (600, 1)), range(600))])
-    np.testing.assert_allclose(np.sum(drawn.var(axis=0)), np.sum(judged), rtol=0.25)
+        Discrepancy(ensemble.discrepancy.posterior, (trials[0].episode(),), {})
 
 
 def test_where_no_hyperparameters_are_found_they_are_the_prior_medians_and_nothing_is_random():
     """A feature that is infinite has no likelihood. Matern 3/2 in closed form."""
-    draw = np.random.default_rng(0)
+    settings, draw = TwinSettings(), np.random.default_rng(0)
     x, left, variance = np.full((1, 20, 2), np.inf), draw.standard_normal((1, 20)), np.full((1, 20), 1e-4)
     nodes = draw.uniform(size=(1, 6, 2))
     before = torch.random.get_rng_state()
-    with pytest.warns(SurrogateWarning, match="the error of the twin in 20 stretches could not be fitted"):
-        (found,) = _fit(x, left, variance, nodes)
+    with pytest.warns(SurrogateWarning, match="the discrepancy of the twin in 20 bins could not be fitted"):
+        (found,) = _fit(x, left, variance, nodes, settings)
     assert torch.equal(torch.random.get_rng_state(), before)
-    distance = np.sqrt(3.0) * np.linalg.norm((nodes[0, :, None] - nodes[0]) / LENGTH[:2], axis=-1)
+    distance = np.sqrt(3.0) * np.linalg.norm((nodes[0, :, None] - nodes[0]) / settings.length_scales[:2], axis=-1)
     np.testing.assert_allclose(found.kernel, (1 + distance) * np.exp(-distance), atol=1e-6)
     assert found.variance == pytest.approx(np.mean(left**2))

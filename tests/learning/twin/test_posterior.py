@@ -1,77 +1,51 @@
-"""Draws of a posterior against the equation that they are to solve, and another solver of it."""
+"""Draws of a posterior against its moments, and what it states of new samples against draws."""
 
 import numpy as np
 import pytest
-from scipy.optimize import root
+from toy_loop import NOISE, SPACE, Plant, ToyLoop
 
-from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.plants.sensors import Sensors
+from chargetune.episode.episode import Ending
+from chargetune.learning.twin.laplace import fit
+from chargetune.learning.twin.posterior import Posterior
+from chargetune.learning.twin.rollout import predict_each
 
-# In standard deviations of the posterior, what of the equation may be left, squared; and what a solution further on may differ by.
-LEFT, AWAY = 0.05, 0.3
-
-
-@pytest.fixture(scope="module")
-def posterior():
-    problem = ChargingProblem(
-        default_cell(), mismatch_seed=1, sensors=Sensors(noise_sd={"voltage_V": 0.002}), steps=120, ratios=(ResistanceRatio("R0"),)
-    )
-    return ChargingTwin(problem).twin.fit([problem.episode(problem.space.default, seed=k) for k in (0, 1)])
+pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 
-def equation(posterior, draw):
-    """m -> J'W (y(m) - y(mode) - J (m' - mode)) + S^-1 (m - m'), in standard deviations of the posterior, from the twin alone."""
-    twin, mode = posterior.twin, posterior.mode
-    inputs = [u for u, _ in posterior.seen]
-    slopes = np.concatenate([twin.slopes(mode, u).reshape(-1, mode.size) for u in inputs]) / posterior.spread[0]
-    prior = np.linalg.inv(twin.prior_factor @ twin.prior_factor.T)
-    scale = np.linalg.cholesky(np.linalg.inv(slopes.T @ slopes + prior)).T
-
-    def predicted(m):
-        return np.concatenate([twin.predict(m, u).ravel() for u in inputs]) / posterior.spread[0]
-
-    wanted = predicted(mode) + slopes @ draw
-    return lambda m: scale @ (slopes.T @ (predicted(m) - wanted) + prior @ (m - mode - draw))
+def test_without_data_it_is_the_prior():
+    posterior = fit(ToyLoop().twin, [])
+    steps = np.abs(np.subtract.outer(np.arange(3), np.arange(3)))
+    np.testing.assert_array_equal(posterior.mode, 0.0)
+    np.testing.assert_allclose(posterior.covariance[:3, :3], 0.4**2 * 0.3**steps, atol=1e-12)
+    draws = posterior.draw(8000, 0)
+    np.testing.assert_allclose(np.cov(draws.T), posterior.covariance, atol=0.015)
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.02)
 
 
-def test_draws_solve_their_equation_as_another_solver_does(posterior):
-    """Gaussian draws are far from it: what is predicted is not linear in the logarithms of resistances."""
-    draws = np.random.default_rng(2).standard_normal((24, posterior.root.shape[1])) @ posterior.root.T
-    moved = posterior.moved(draws)
-    sd = np.sqrt(np.diag(posterior.covariance))
-    solved, unmoved = [], []
-    for draw, m in zip(draws, moved, strict=True):
-        left = equation(posterior, draw)
-        unmoved.append(np.sum(left(posterior.mode + draw) ** 2))
-        solved.append(np.sum(left(m) ** 2) < LEFT)
-        if solved[-1]:
-            further = root(left, m, tol=1e-8)
-            assert further.success
-            assert np.max(np.abs(further.x - m) / sd) < AWAY
-    # One in a hundred may not be where it is solved, and is halved.
-    assert np.mean(solved) >= 0.9
-    assert np.mean(np.array(unmoved) > LEFT) >= 0.9
+def test_draws_have_the_moments_of_the_components():
+    """A sum of two Gaussians: mean and variance in closed form."""
+    parts = tuple((share, Posterior(None, np.array([at]), np.array([[sd]]), np.zeros(1), np.ones(1))) for share, at, sd in
+                  ((0.25, -2.0, 0.5), (0.75, 1.0, 1.0)))  # fmt: skip
+    draws = Posterior(None, np.zeros(1), np.eye(1), np.zeros(1), np.ones(1), parts).draw(8000, 4)[:, 0]
+    mean = 0.25 * -2.0 + 0.75 * 1.0
+    assert draws.mean() == pytest.approx(mean, abs=0.03)
+    assert draws.var() == pytest.approx(0.25 * (0.25 + 4.0) + 0.75 * (1.0 + 1.0) - mean**2, rel=0.05)
 
 
-def test_in_factors_a_draw_begins_nearer_than_in_logarithms(posterior):
-    """What a draw begins at is as far from the solution as the data are from linear in what is drawn."""
-    draws = np.random.default_rng(2).standard_normal((24, posterior.root.shape[1])) @ posterior.root.T
-    begun, _ = posterior._moved_by(draws)
-    in_factors, in_logarithms = (
-        [np.sum(equation(posterior, draw)(m) ** 2) for draw, m in zip(draws, starts, strict=True)]
-        for starts in (begun, posterior.mode + draws)
-    )
-    assert np.median(in_factors) < 0.5 * np.median(in_logarithms)
+def test_the_stated_sd_of_a_new_sample_is_that_of_draws_with_noise():
+    twin = ToyLoop().twin
+    posterior = fit(twin, [Plant().episode(SPACE.upper, 0).cut(4, Ending.DONE, "")])
+    inputs = Plant().episode(SPACE.default, 1).input
+    (drawn,) = predict_each(twin, posterior.draw(4000, 2), [inputs])
+    expected = np.sqrt(drawn.var(axis=0) + NOISE**2 + posterior.discrepancy_sd**2)
+    stated = posterior.predicted_sd(inputs)
+    assert stated.max() > 10 * NOISE
+    np.testing.assert_allclose(stated, expected, rtol=0.25)
 
 
-def test_a_draw_that_may_not_be_where_it_is_brought_to_is_halved(posterior, monkeypatch):
-    draws = np.random.default_rng(2).standard_normal((4, posterior.root.shape[1])) @ posterior.root.T
-    whole, half = posterior.moved(draws), posterior.moved(0.5 * draws)
-    refused = iter([np.array([1.0, np.nan, 1.0, np.inf]), np.array([1.0, 1.0])])
-    led = type(posterior)._led
-    monkeypatch.setattr(type(posterior), "_led", lambda self, some: (led(self, some)[0], next(refused)))
-    moved = posterior.moved(draws)
-    np.testing.assert_allclose(moved[[0, 2]], whole[[0, 2]], atol=1e-12)
-    np.testing.assert_allclose(moved[[1, 3]], half[[1, 3]], atol=1e-12)
+def test_draws_do_not_depend_on_how_many_cores_there_are(monkeypatch):
+    posterior = fit(ToyLoop().twin, [Plant().episode(SPACE.upper, 0)])
+    drawn = posterior.draw(6, 3)
+    monkeypatch.setattr("chargetune.runtime.threads.usable_cores", lambda: 1)
+    again = fit(ToyLoop().twin, [Plant().episode(SPACE.upper, 0)])
+    np.testing.assert_array_equal(again.draw(6, 3), drawn)
