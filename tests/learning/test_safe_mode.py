@@ -181,7 +181,7 @@ def unforeseen():
 
 def test_a_twin_that_is_none_repeats_the_best_trial_and_says_so():
     trials = unforeseen()
-    assert condition(ToyLoop(), trials).is_none
+    assert condition(ToyLoop(), trials).rejected
     assert [t.score.feasible for t in trials] == [True] * 3
     best = max(trials, key=lambda t: t.score.objective)
     with pytest.warns(RuntimeWarning, match="is no model of this plant: .*; the best trial is repeated"):

@@ -85,7 +85,7 @@ def test_a_twin_is_none_where_the_newest_prediction_failed_or_no_scale_is_large_
     most = settings.standardised_error_max
 
     def says(*checks):
-        return Ensemble(ToyLoop(), settings, None, checks).is_none
+        return Ensemble(ToyLoop(), settings, None, checks).rejected
 
     assert says() == says(flat(1.0), flat(0.99 * most)) == says(flat(2 * most), flat(1.0)) == ""
     # One prediction alone rests on a single trace.
