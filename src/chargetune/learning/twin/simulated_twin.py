@@ -15,6 +15,7 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.score import Score
 from chargetune.episode.score_limits import ScoredLimit, Windows, limit_samples, score_limits, violation
+from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.rollout import parameters, start_state
 from chargetune.learning.twin.twin import Twin, Uncertain
@@ -41,6 +42,18 @@ class TwinSimulator:
     twin: Twin
     features: Mapping[str, tuple[float, float]]
     steps: int
+
+    def __post_init__(self) -> None:
+        plant, model = SimulatedPlant(self.twin.model, self.twin.start), self.twin.model
+        check_run(plant, self.steps, 0, ())
+        signal_indices(self.controller, plant)
+        names = (*model.output_names, *model.input_names)
+        for name, (low, high) in self.features.items():
+            if name not in names:
+                raise ValueError(f"twin: features name {name!r}, allowed are {', '.join(names)}")
+            if not -np.inf < low < high < np.inf:
+                raise ValueError(f"twin: range of {name} = [{low!r}, {high!r}], allowed are finite numbers, the first one less")
+        LookupTable.over(self.features, ())
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
         """An episode of each member, None where it did not come to its end.
@@ -100,6 +113,13 @@ class SimulatedTwin:
     limits: tuple[ScoredLimit, ...]
     objective: Callable[[Episode], float]
     windows: Windows | None = None
+
+    def __post_init__(self) -> None:
+        outputs = self.twin.model.output_names
+        for signal in (*(limit.signal for limit in self.limits), *([self.windows.signal] if self.windows else [])):
+            if signal not in outputs:
+                raise ValueError(f"twin: a limit or the windows of {signal!r}, allowed are {', '.join(outputs)}")
+        TwinSimulator(self.controller, self.twin, self.features, self.steps)
 
     @classmethod
     def build(
