@@ -1,12 +1,13 @@
 """The crane of the examples: both ways to tune it, on the true plant."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from chargetune.episode.episode import Trip
+from chargetune.episode.episode import Ending, Trip
 from chargetune.episode.stepwise import run_episode
 from chargetune.study.evaluation import evaluate_trial
 
@@ -59,3 +60,15 @@ def test_a_move_that_ends_early_is_a_failed_trial(example):
     assert outcome.score is None
     assert outcome.trace is not None
     assert outcome.ending.startswith("limit trip: position")
+
+
+def test_a_move_that_the_user_interrupted_says_nothing_of_theta(example):
+    """It stops the study, as Ctrl-C does, and its trial is run again."""
+    crane = example("custom_system")
+
+    def evaluate(theta, seed):
+        _, episode, _ = crane["evaluate"](theta, seed)
+        return crane["ct"].score_limits(replace(episode, ending=Ending.INTERRUPTED), crane["LIMITS"], objective=crane["closeness"])
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_trial(evaluate, tuple(crane["SPACE"].default), 0)
