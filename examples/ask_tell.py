@@ -5,20 +5,18 @@ Here the charge is simulated; on a test bench `charge` would run the cycler. Run
 
 import sys
 
+import chargetune as ct
 from chargetune.battery.case_study.configurations import case_study
-from chargetune.learning import ConstrainedLogEI
-from chargetune.study.store.store import Store
-from chargetune.study.study import Study
 
 
 def main(trials, path):
     """A study in a file: stop it at any time, run it again, and it goes on."""
     config = case_study("backoff", mismatch_seed=1)
     problem = config.problem()
-    tuner = ConstrainedLogEI(seed=0)
+    tuner = ct.ConstrainedLogEI(seed=0)
     with (
-        Store(path) as store,
-        Study.create_or_resume(store, "my cell", config=config.document(), space=problem.space, tuner=tuner) as study,
+        ct.Store(path) as store,
+        ct.Study.create_or_resume(store, "my cell", config=config.document(), space=problem.space, tuner=tuner) as study,
     ):
         while True:
             # A charge that was cut off last time comes first, then the tuner's next proposal.
@@ -26,11 +24,10 @@ def main(trials, path):
             if not waiting:
                 break
             for trial in waiting:
-                try:
-                    episode = problem.episode(trial.theta, trial.seed)
-                    score = problem.score(episode)
-                except (RuntimeError, ValueError) as error:
-                    study.fail(trial.number, str(error))
+                # A charge that did not come to its end has no score: over fewer intervals it would look better.
+                score, episode, ending = problem(trial.theta, trial.seed)
+                if score is None:
+                    study.fail(trial.number, ending)
                     continue
                 study.tell(trial.number, score, episode)
                 m = score.metrics

@@ -5,23 +5,11 @@ the cost (weight of the swing) and one in the model (rope length). Run: python e
 """
 
 import sys
-import tempfile
-from pathlib import Path
 
 import casadi as ca
-import numpy as np
+import matplotlib.pyplot as plt
 
-from chargetune.control.controller import Controller, SoftLimit
-from chargetune.control.estimators import ExactState
-from chargetune.episode.compiled import simulate
-from chargetune.episode.score import Score
-from chargetune.learning import ConstrainedLogEI
-from chargetune.model.integrators import rk4
-from chargetune.model.model import Model, Signal
-from chargetune.model.parameter_space import Parameter, ParameterSpace
-from chargetune.plants.simulated import SimulatedPlant
-from chargetune.study.store.store import Store
-from chargetune.study.study import Study
+import chargetune as ct
 
 TS, STEPS, SWING_MAX_RAD = 0.1, 80, 0.10
 
@@ -35,70 +23,47 @@ def crane(rope_m):
             swing = -(9.81 * ca.sin(angle) + u["acceleration"] * ca.cos(angle)) / p["rope_m"]
             return ca.vertcat(speed, u["acceleration"], turn, swing - 0.05 * turn)
 
-        after = rk4(rate, x.vector, TS, substeps=2)
-        names = ("position", "speed", "angle", "turn")
-        return dict(zip(names, ca.vertsplit(after), strict=True)), {name: x[name] for name in names}
+        return dict(zip(x, ca.vertsplit(ct.rk4(rate, x.vector, TS, substeps=2)), strict=True)), x
 
-    signals = (Signal("position", "m"), Signal("speed", "m/s"), Signal("angle", "rad"), Signal("turn", "rad/s"))
-    return Model.build(
-        "crane", states=signals, inputs=(Signal("acceleration", "m/s2"),), outputs=signals,
-        parameters={"rope_m": rope_m}, sampling_time_s=TS, equations=equations,
-    )  # fmt: skip
+    states = [ct.Signal("position", "m"), ct.Signal("speed", "m/s"), ct.Signal("angle", "rad"), ct.Signal("turn", "rad/s")]
+    return ct.Model.build("crane", states=states, inputs=[ct.Signal("acceleration", "m/s2")], outputs=states,
+                          parameters={"rope_m": rope_m}, sampling_time_s=TS, equations=equations)  # fmt: skip
 
 
-SPACE = ParameterSpace((
-    Parameter("swing_weight", 1e-2, 1e2, default=0.1, scale="log"),
-    Parameter("rope_m", 0.5, 2.0, default=0.6, unit="m"),
-))  # fmt: skip
-
-
-def cost(s):
-    """Distance from the set-point, a little speed and effort, and the swing by a tuned weight."""
-    away = (s.x["position"] - s.x_d["position"]) ** 2
-    return away + 0.1 * s.x["speed"] ** 2 + s.theta["swing_weight"] * s.x["angle"] ** 2 + 0.01 * s.u["acceleration"] ** 2
-
-
-CONTROLLER = Controller.build(
-    crane(0.6), SPACE, horizon=20, stage_cost=cost,
-    terminal_cost=lambda s: 10 * ((s.x["position"] - s.x_d["position"]) ** 2 + s.x["speed"] ** 2),
-    parameters=lambda s: {"rope_m": s.theta["rope_m"]},
+SPACE = ct.ParameterSpace((ct.Parameter("swing_weight", 1e-2, 1e2, default=0.1, scale="log"),
+                           ct.Parameter("rope_m", 0.5, 2.0, default=0.6, unit="m")))  # fmt: skip
+CONTROLLER = ct.Controller.build(
+    crane(0.6), SPACE, horizon=20, parameters=lambda s: {"rope_m": s.theta["rope_m"]},
+    stage_cost=lambda s: ((s.x["position"] - 2) ** 2 + 0.1 * s.x["speed"] ** 2 + 0.01 * s.u["acceleration"] ** 2
+                          + s.theta["swing_weight"] * s.x["angle"] ** 2),
+    terminal_cost=lambda s: 10 * ((s.x["position"] - 2) ** 2 + s.x["speed"] ** 2),
     input_lower={"acceleration": -1.0}, input_upper={"acceleration": 1.0}, fallback={"acceleration": 0.0},
-    limits=[SoftLimit("angle", lower=-SWING_MAX_RAD, upper=SWING_MAX_RAD, at="end", penalty=1e4, scale=0.1)],
-    setpoint={"position": 2.0}, estimator=ExactState(),
-)  # fmt: skip
+    limits=[ct.SoftLimit("angle", lower=-SWING_MAX_RAD, upper=SWING_MAX_RAD, penalty=1e4, scale=0.1)])  # fmt: skip
+LIMITS = [ct.ScoredLimit("angle", lower=-SWING_MAX_RAD, upper=SWING_MAX_RAD, tolerance=1e-3)]
+
+
+def closeness(episode):
+    """Minus the distance still to go, integrated over the move, m s."""
+    return -TS * float(abs(2.0 - episode.signal("position")[1]).sum())
 
 
 def evaluate(theta, seed):
-    """One move of the real crane: the distance still to go, integrated, and how far the load swung."""
-    episode = simulate(CONTROLLER, SimulatedPlant(crane(1.0), {}), steps=STEPS, theta=theta, seed=seed)
-    position, angle = episode.signal("position")[1], episode.signal("angle")[1]
-    distance = float(np.sum(np.abs(2.0 - position)) * TS)
-    excess = float(np.max(np.abs(angle)) - SWING_MAX_RAD)
-    score = Score(
-        objective=-distance,
-        performance=-distance - 100 * max(0.0, excess),
-        excess={"swing_rad": excess},
-        tolerance={"swing_rad": 1e-3},
-        metrics={"distance_ms": distance, "swing_rad": excess + SWING_MAX_RAD},
-    )
-    return score, episode, episode.ending.value
+    """One move of the real crane, and its score."""
+    episode = ct.simulate(CONTROLLER, ct.SimulatedPlant(crane(1.0), {}), steps=STEPS, theta=theta, seed=seed)
+    return ct.score_limits(episode, LIMITS, objective=closeness, penalty=0.1)
 
 
 def main(trials):
-    """Tune, and print the untuned and the tuned run."""
-    with tempfile.TemporaryDirectory() as folder, Store(Path(folder) / "crane.sqlite") as store:
-        setup = {"system": "crane", "steps": STEPS, "swing_max_rad": SWING_MAX_RAD}
-        with Study.create_or_resume(store, "crane", config=setup, space=SPACE, tuner=ConstrainedLogEI(seed=0)) as study:
-            best = study.run(evaluate, trials, progress=lambda *_: print(".", end="", flush=True))
-            untuned = study.trials()[0]
-    print()
-    for name, trial in (("untuned", untuned), ("tuned", best)):
-        if trial is None or trial.score is None:
-            print(f"{name}: no trial kept the limit")
-            continue
-        m = trial.score.metrics
-        values = ", ".join(f"{n} = {v:.3g}" for n, v in zip(SPACE.entries, trial.theta, strict=True))
-        print(f"{name:8}: swing {m['swing_rad']:.3f} rad (limit {SWING_MAX_RAD}), distance integral {m['distance_ms']:.3f} m s, {values}")
+    """Tune in crane.sqlite, where a second run goes on, and draw the untuned and the best move in crane.pdf."""
+    study = {"config": {"system": "crane"}, "space": SPACE, "tuner": ct.ConstrainedLogEI(seed=0)}
+    with ct.Store("crane.sqlite") as store, ct.Study.create_or_resume(store, "crane", **study) as tuning:
+        best = tuning.run(evaluate, trials)
+    for name, theta in [("untuned", SPACE.default), *([("tuned", best.theta)] if best else [])]:
+        score, episode, ending = evaluate(theta, seed=0)
+        print(f"{name}: {ending}, objective {score.objective:.3f} m s, swing beyond its limit {score.excess['angle']:.3f} rad")
+        plt.plot(episode.time_s, episode.signal("angle")[1], label=f"{name}: swing (rad)")
+    plt.legend()
+    plt.savefig("crane.pdf")
 
 
 if __name__ == "__main__":

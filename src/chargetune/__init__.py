@@ -4,9 +4,145 @@ cell -> model -> controller(theta) -> plant -> episode -> score -> tuner -> tria
 
 Signs and units everywhere: current is positive when it charges; volts, amperes, seconds, ohm, farad, kelvin; state of
 charge from 0 to 1; capacity in ampere-hours. Where a person types a number its name carries the unit (``voltage_max_V``).
+
+``import chargetune as ct`` offers what a study needs, ``ct.Model`` to ``ct.TwinTuner``. Each name is imported when it is first
+asked for: the import itself takes no time.
 """
 
-__all__ = ["__version__"]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from chargetune.battery.identification.pulse_fit import identify
+    from chargetune.battery.studies.open_study import open_study
+    from chargetune.battery.studies.study_file import load_config
+    from chargetune.control.controller import Controller, SoftLimit, Stage
+    from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+    from chargetune.episode.compiled import simulate
+    from chargetune.episode.episode import Ending, Episode, Trip
+    from chargetune.episode.score import Score
+    from chargetune.episode.score_limits import Evaluation, ScoredLimit, Windows, score_limits
+    from chargetune.episode.stepwise import run_episode
+    from chargetune.learning.black_box.composite import Composite
+    from chargetune.learning.black_box.constrained_ei import ConstrainedLogEI
+    from chargetune.learning.black_box.expected_improvement import ExpectedImprovement
+    from chargetune.learning.closed_loop.iterative_learning import IterativeLearning
+    from chargetune.learning.initial_design import Sobol
+    from chargetune.learning.safety import NoSafeThetaError, Safety
+    from chargetune.learning.twin.settings import TwinSettings
+    from chargetune.learning.twin.simulated_twin import SimulatedTwin
+    from chargetune.learning.twin.twin import Twin, Uncertain
+    from chargetune.learning.twin_tuner import TwinTuner
+    from chargetune.model.integrators import rk4
+    from chargetune.model.model import Model, Signal
+    from chargetune.model.parameter_space import Parameter, ParameterSpace
+    from chargetune.plants.sensors import Sensors
+    from chargetune.plants.simulated import SimulatedPlant
+    from chargetune.study.store.store import Store
+    from chargetune.study.study import Study
+    from chargetune.study.warm_start import Earlier
+
+__all__ = [
+    "Composite",
+    "ConstrainedLogEI",
+    "Controller",
+    "Earlier",
+    "Ending",
+    "Episode",
+    "Evaluation",
+    "ExactState",
+    "ExpectedImprovement",
+    "ExtendedKalman",
+    "IterativeLearning",
+    "Model",
+    "NoSafeThetaError",
+    "Parameter",
+    "ParameterSpace",
+    "Propagated",
+    "Safety",
+    "Score",
+    "ScoredLimit",
+    "Sensors",
+    "Signal",
+    "SimulatedPlant",
+    "SimulatedTwin",
+    "Sobol",
+    "SoftLimit",
+    "Stage",
+    "Store",
+    "Study",
+    "Trip",
+    "Twin",
+    "TwinSettings",
+    "TwinTuner",
+    "Uncertain",
+    "Windows",
+    "__version__",
+    "identify",
+    "load_config",
+    "open_study",
+    "rk4",
+    "run_episode",
+    "score_limits",
+    "simulate",
+]
 
 # A literal, not importlib.metadata: reading the metadata costs a tenth of the time that ``chargetune --help`` may take.
 __version__ = "0.1.0"
+
+_MODULES = {
+    "Composite": "learning.black_box.composite",
+    "ConstrainedLogEI": "learning.black_box.constrained_ei",
+    "Controller": "control.controller",
+    "Earlier": "study.warm_start",
+    "Ending": "episode.episode",
+    "Episode": "episode.episode",
+    "Evaluation": "episode.score_limits",
+    "ExactState": "control.estimators",
+    "ExpectedImprovement": "learning.black_box.expected_improvement",
+    "ExtendedKalman": "control.estimators",
+    "IterativeLearning": "learning.closed_loop.iterative_learning",
+    "Model": "model.model",
+    "NoSafeThetaError": "learning.safety",
+    "Parameter": "model.parameter_space",
+    "ParameterSpace": "model.parameter_space",
+    "Propagated": "control.estimators",
+    "Safety": "learning.safety",
+    "Score": "episode.score",
+    "ScoredLimit": "episode.score_limits",
+    "Sensors": "plants.sensors",
+    "Signal": "model.model",
+    "SimulatedPlant": "plants.simulated",
+    "SimulatedTwin": "learning.twin.simulated_twin",
+    "Sobol": "learning.initial_design",
+    "SoftLimit": "control.controller",
+    "Stage": "control.controller",
+    "Store": "study.store.store",
+    "Study": "study.study",
+    "Trip": "episode.episode",
+    "Twin": "learning.twin.twin",
+    "TwinSettings": "learning.twin.settings",
+    "TwinTuner": "learning.twin_tuner",
+    "Uncertain": "learning.twin.twin",
+    "Windows": "episode.score_limits",
+    "identify": "battery.identification.pulse_fit",
+    "load_config": "battery.studies.study_file",
+    "open_study": "battery.studies.open_study",
+    "rk4": "model.integrators",
+    "run_episode": "episode.stepwise",
+    "score_limits": "episode.score_limits",
+    "simulate": "episode.compiled",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    # The next time it is found at once.
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

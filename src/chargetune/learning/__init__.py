@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.tuner import TrialLike, Tuner
     from chargetune.learning.twin.posterior import Posterior
+    from chargetune.learning.twin.settings import TwinSettings
+    from chargetune.learning.twin.simulated_twin import SimulatedTwin
     from chargetune.learning.twin.twin import Twin, Uncertain
     from chargetune.learning.twin_tuner import TwinTuner
 
@@ -29,10 +31,12 @@ __all__ = [
     "NoSafeThetaError",
     "Posterior",
     "Safety",
+    "SimulatedTwin",
     "Sobol",
     "TrialLike",
     "Tuner",
     "Twin",
+    "TwinSettings",
     "TwinTuner",
     "Uncertain",
 ]
@@ -46,10 +50,12 @@ _MODULES = {
     "NoSafeThetaError": "safety",
     "Posterior": "twin.posterior",
     "Safety": "safety",
+    "SimulatedTwin": "twin.simulated_twin",
     "Sobol": "initial_design",
     "TrialLike": "tuner",
     "Tuner": "tuner",
     "Twin": "twin.twin",
+    "TwinSettings": "twin.settings",
     "TwinTuner": "twin_tuner",
     "Uncertain": "twin.twin",
 }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.study.serialization import score_to_json
 from chargetune.study.store.trace import Traceable, encode
@@ -36,13 +37,16 @@ def trial_seed(study_seed: int, number: int) -> int:
 def evaluate_trial(evaluate: Evaluate, theta: tuple[float, ...], seed: int) -> Outcome:
     """Run one evaluation. What it raises, or returns against its contract, becomes an outcome without score that says so.
 
-    KeyboardInterrupt and SystemExit pass through: they stop the study, they say nothing about theta.
+    KeyboardInterrupt and SystemExit pass through: they stop the study, they say nothing about theta. So does an episode that the user
+    interrupted, which `run_episode` returns as such.
     """
     try:
         score, episode, ending = evaluate(np.array(theta), seed)
         trace = None if episode is None else encode(episode.arrays(), episode.meta())
     except Exception as error:  # noqa: BLE001 - whatever a plant or a controller raises is this trial's failure, not the study's
         return Outcome(None, None, f"{type(error).__name__}: {error}")
+    if isinstance(episode, Episode) and episode.ending is Ending.INTERRUPTED:
+        raise KeyboardInterrupt(episode.message)
     if not isinstance(ending, str) or not ending:
         return Outcome(None, trace, f"ValueError: ending = {ending!r}, allowed is a non-empty string")
     try:

@@ -10,7 +10,7 @@ from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.kalman import Kalman
-from chargetune.battery.charging.limits import Limit, moving_mean
+from chargetune.battery.charging.limits import Limit
 from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
 from chargetune.battery.charging.tunables import CurrentLimit, LimitBackoff, MeasurementSpread
 from chargetune.battery.studies.study_file import load_config, problem_of_document
@@ -127,25 +127,6 @@ def test_the_verdict_on_noise_is_nearer_the_truth():
     true = float(np.max(episode.signal("voltage_V", true=True))) - 4.2
     assert plain.excess["voltage_max_V"] > 0.005
     assert true < mean.excess["voltage_max_V"] < 0.6 * plain.excess["voltage_max_V"]
-
-
-def test_moving_mean_by_hand():
-    np.testing.assert_allclose(moving_mean(np.array([0.0, 3.0, 6.0, 0.0]), 3), [1.5, 3.0, 3.0, 3.0])
-    np.testing.assert_allclose(moving_mean(np.array([1.0, 2.0]), 9), [1.5, 1.5])
-    assert moving_mean(np.zeros(0), 3).size == 0
-
-
-@pytest.mark.parametrize("samples", [1, 2, 3, 4, 9])
-def test_a_lost_sample_is_left_out_of_the_mean_and_spoils_no_other(samples):
-    draw = np.random.default_rng(4)
-    values = draw.normal(size=40)
-    values[[0, 7, 8, 9, 10, 11, 20]] = [np.nan, np.nan, np.inf, np.nan, np.nan, -np.inf, np.nan]
-    found = moving_mean(values, samples)
-    for k in range(values.size):
-        part = values[max(0, k - samples // 2) : k + (samples - 1) // 2 + 1]
-        known = part[np.isfinite(part)]
-        if samples > 1:
-            assert found[k] == pytest.approx(np.mean(known)) if known.size else np.isnan(found[k]), k
 
 
 @pytest.mark.parametrize("samples", [1, 5])

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
+from chargetune.episode.score_limits import ScoredLimit
 
-__all__ = ["HARD_FACTOR", "Limit", "moving_mean"]
+__all__ = ["HARD_FACTOR", "Limit"]
 
 # The penalty of a hard limit over that of a soft one: nothing soft is worth a violation of it.
 HARD_FACTOR = 1e3
@@ -63,14 +64,22 @@ class Limit:
     def unit(self) -> str:
         return self.name.rpartition("_")[2]
 
-    def excess(self, episode: Episode, samples: int = 1) -> NDArray[np.float64]:
-        """By how much each interval is beyond the limit, the worse of its two ends, shape (K,).
+    def scored(self, samples: int = 1, tolerance: float | None = None) -> ScoredLimit:
+        """The same for the verdict: on the moving mean of ``samples`` intervals, with another tolerance where one is given.
 
-        A lost sample is left out; nan where nothing is known of an interval. ``samples`` > 1 judges the moving mean of as many
-        intervals, for measurements with noise: the largest of 720 samples with a standard deviation of 2 mV is 6 mV above the truth.
+        The lower voltage limit is met at rest, not along the charge: it has no profile.
         """
-        start, end = (moving_mean(values, samples) for values in episode.signal(self.signal))
-        return np.fmax(start, end) - self.bound if self.upper else self.bound - np.fmin(start, end)
+        side = {"upper" if self.upper else "lower": self.bound}
+        kept = self.tolerance if tolerance is None else tolerance
+        return ScoredLimit(self.signal, **side, tolerance=kept, name=self.name, samples=samples, by_window=self.name != "voltage_min_V")
+
+    def excess(self, episode: Episode, samples: int = 1) -> NDArray[np.float64]:
+        """By how much each interval is beyond the limit, the worse of its two ends, shape (K,): `ScoredLimit.excess`.
+
+        ``samples`` > 1 judges the moving mean of as many intervals, for measurements with noise: the largest of 720 samples with a
+        standard deviation of 2 mV is 6 mV above the truth.
+        """
+        return self.scored(samples).excess(episode)
 
     def metrics(self, episode: Episode, samples: int = 1) -> dict[str, float]:
         """Worst excess (signed) and its integral over time, in mV and mV s or K and K s.
@@ -79,26 +88,8 @@ class Limit:
         """
         factor, unit = (1e3, "mV") if self.unit == "V" else (1.0, self.unit)
         short = self.name.rpartition("_")[0]
-        both = np.stack([moving_mean(values, samples) for values in episode.signal(self.signal)])
-        over = both - self.bound if self.upper else self.bound - both
+        over = self.scored(samples).excess_at_ends(episode)
         return {
             f"{short}_excess_{unit}": float(factor * np.max(over)),
             f"{short}_excess_{unit}s": float(factor * episode.sampling_time_s * np.sum(np.maximum(0.0, over).mean(axis=0))),
         }
-
-
-def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64]:
-    """Centred mean of ``samples`` neighbours, fewer at the ends, shape unchanged.
-
-    A value that is no finite number is a lost one: the mean is that of the others, and nan where all are lost.
-    """
-    if samples == 1:
-        return values
-    known = np.isfinite(values)
-    total, count = (np.concatenate([[0.0], np.cumsum(v)]) for v in (np.where(known, values, 0.0), known))
-    at = np.arange(values.size)
-    first = np.maximum(at - samples // 2, 0)
-    beyond = np.minimum(at + (samples - 1) // 2 + 1, values.size)
-    counted = count[beyond] - count[first]
-    mean = (total[beyond] - total[first]) / np.maximum(counted, 1.0)
-    return np.asarray(np.where(counted > 0, mean, np.nan), dtype=np.float64)

@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.charging.problem import ChargingProblem, NotMeasuredError, stand_in
 from chargetune.control.controller import Controller
-from chargetune.episode.compiled import CompiledEpisode, compiled_episode
-from chargetune.episode.episode import Ending, Episode
-from chargetune.episode.lookup_table import LookupTable
+from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
-from chargetune.model.model import Model
-from chargetune.plants.simulated import SimulatedPlant
 
 if TYPE_CHECKING:
-    from chargetune.learning.twin.discrepancy import DiscrepancySample
+    from chargetune.learning.twin.simulated_twin import TwinSimulator
     from chargetune.learning.twin.twin import Twin
     from chargetune.learning.twin.twin_loop import Member
 
@@ -33,8 +29,6 @@ LEAST_NOISE = {"voltage_V": 1e-3, "temperature_K": 0.05, "anode_potential_V": 1e
 LEAST_ERROR = {"voltage_V": 3e-3, "temperature_K": 0.3, "anode_potential_V": 3e-3}
 # Of the variance of that error, what an identified OCV leaves without current.
 OCV_SHARE = 1.0
-# Plants that are remembered: those that thetas are chosen by, and those that the chosen one is judged by.
-PLANTS_KEPT = 256
 # Windows of the SOC in which a predicted excess is told to the search.
 WINDOWS = 24
 
@@ -63,7 +57,8 @@ class ChargingTwin:
 
         problem = self.problem
         belief = problem.controller_cell
-        model = self._circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
+        circuit = ecm_model(problem.plant_cell, problem.sampling_time_s)
+        model = circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
         anode = belief.anode is not None and problem.anode_min_V is not None
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
@@ -75,10 +70,6 @@ class ChargingTwin:
         # Of the cell's own circuit the OCV is known, and but for an unknown that is its error. Else it was identified, worst near full.
         at_rest = OCV_SHARE if problem.plant_model and not self.ocv_spread_V else 0.0
         return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
-
-    @cached_property
-    def _circuit(self) -> Model:
-        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
@@ -101,43 +92,15 @@ class ChargingTwin:
     def row_tolerances(self) -> NDArray[np.float64]:
         return self.problem.row_tolerances
 
-    def simulate(self, cases: Sequence[Member]) -> list[Episode | None]:
-        """Charges without noise, with the third of each case added to what is measured and so to what the estimator reads."""
-        thetas, plants = [theta for theta, _, _ in cases], [self._plant(unknowns) for _, unknowns, _ in cases]
-        episodes = self._loop.run_each(thetas, plants, tables=[self._table(unknowns, error) for _, unknowns, error in cases])
-        return [episode if episode.ending is Ending.DONE else None for episode in episodes]
-
-    def _table(self, unknowns: NDArray[np.float64], error: DiscrepancySample | None) -> NDArray[np.float64]:
-        """The error and the constants of the unknowns, both of what is measured, on `_lookup_table`."""
-        biases = self.twin.biases(unknowns)
-        constants = np.array([biases.get(name, 0.0) for name in self._lookup_table.outputs])[:, None]
-        return np.tile(constants, self._lookup_table.size) if error is None else error.table + constants
+    def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
+        """Charges without noise, with the discrepancy of each member added to what is measured and so to what the estimator reads."""
+        return self._simulator.simulate(members)
 
     @cached_property
-    def _lookup_table(self) -> LookupTable:
-        return LookupTable.over(self.features, list(self.twin.noise_sd))
+    def _simulator(self) -> TwinSimulator:
+        from chargetune.learning.twin.simulated_twin import TwinSimulator
 
-    def _plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
-        # An ensemble goes through many thetas: its plants are made once.
-        key = unknowns.tobytes()
-        if key not in self._plants:
-            while len(self._plants) >= PLANTS_KEPT:
-                self._plants.pop(next(iter(self._plants)))
-            self._plants[key] = self._made(unknowns)
-        return self._plants[key]
-
-    @cached_property
-    def _plants(self) -> dict[bytes, SimulatedPlant]:
-        return {}
-
-    def _made(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
-        from chargetune.learning.twin.rollout import parameters
-        from chargetune.learning.twin.rollout import start_state as begin
-
-        sizes, own = self.twin.model.parameter_blocks, self._loop.plant
-        values = np.split(parameters(self.twin, unknowns), np.cumsum(list(sizes.values()))[:-1])
-        start = dict(zip(own.model.state_names, (float(v) for v in begin(self.twin, unknowns)), strict=True))
-        return replace(own, model=own.model.with_parameters(**dict(zip(sizes, values, strict=True))), start=start)
+        return TwinSimulator(self.controller, self.twin, self.features, self.problem.steps)
 
     def violation(self, episode: Episode) -> float:
         """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""
@@ -162,13 +125,3 @@ class ChargingTwin:
         """Limits of the problem that the circuit does not predict: nothing is known of them before they are tried."""
         known = {limit.name for limit in self._exact.limits}
         return tuple(limit.name for limit in self.problem.limits if limit.name not in known)
-
-    @cached_property
-    def _loop(self) -> CompiledEpisode:
-        problem = self._exact
-        plant = problem.plant
-        if not isinstance(plant, SimulatedPlant):
-            raise TypeError("the twin's plant is a simulated circuit")
-        return compiled_episode(
-            self.problem.controller, replace(plant, model=self._circuit), problem.steps, lookup_table=self._lookup_table
-        )
