@@ -35,7 +35,7 @@ def test_three_trials_and_none_breaks_the_limit(seed):
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
     """The loop states that the gauge may be off by a hundredth, which is what it is."""
-    plant, tuner = Plant(extra=structural), replace(SAFE, loop=ToyLoop(discrepancy_sd_floor={"gauge": 1e-2}))
+    plant, tuner = Plant(unmodelled=structural), replace(SAFE, loop=ToyLoop(discrepancy_sd_floor={"gauge": 1e-2}))
     trials = plant.learn(tuner, 4)
     assert max(excess(plant, trials)) <= 3 * TOLERANCE
     assert excess(plant, trials)[-1] <= TOLERANCE
@@ -149,7 +149,7 @@ def test_where_nothing_that_was_tried_is_safe_nothing_is_proposed():
 
 
 def test_candidates_keep_every_limit_on_the_stated_share_of_the_plants_the_best_first():
-    plant = Plant(extra=structural)
+    plant = Plant(unmodelled=structural)
     trials = plant.learn(SAFE, 2)
     proposal = Proposal(SPACE, condition(SAFE.loop, trials), trials, 0.95, 3)
     accepted, _ = proposal.search()
@@ -174,7 +174,7 @@ def unforeseen():
     """Three trials whose gauge no vessel has."""
     trials = []
     for number, level in enumerate((3.0, 2.5, 2.0)):
-        plant = Plant(extra=lambda height, _, n=number: -0.1 + 0.1 * np.sin(25 * height + 2 * n))
+        plant = Plant(unmodelled=lambda height, _, n=number: -0.1 + 0.1 * np.sin(25 * height + 2 * n))
         trials.append(plant.trial(number, np.full(3, level)))
     return trials
 
@@ -209,7 +209,7 @@ def test_trials_of_another_plant_are_refused():
 def test_an_unknown_start_is_learnt_safely():
     """What the vessel holds at the start is unknown too."""
     loop = ToyLoop((*UNKNOWNS, Uncertain("gauge", 0.02, "bias")))
-    plant = Plant(extra=lambda level, _: 0.015 + 0.0 * level)
+    plant = Plant(unmodelled=lambda level, _: 0.015 + 0.0 * level)
     trials = plant.learn(replace(SAFE, loop=loop), 3)
     assert max(excess(plant, trials)) <= TOLERANCE
 

@@ -18,7 +18,7 @@ TUNER = TwinTuner(ToyLoop())
 @pytest.mark.parametrize("seed", [0, 1])
 def test_three_trials_are_enough(extra, seed):
     """-0.4365 and -0.4408 are what differential evolution reaches on these plants with the whole tolerance."""
-    plant, tuner = Plant(extra=extra), replace(TUNER, seed=seed)
+    plant, tuner = Plant(unmodelled=extra), replace(TUNER, seed=seed)
     trials = plant.learn(tuner, 3, seed)
     np.testing.assert_array_equal(trials[0].theta, SPACE.default)
     score = plant.truth(trials[-1].theta)

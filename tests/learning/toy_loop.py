@@ -74,7 +74,8 @@ def episode_of(inflow, levels, swirls, gauge_start, gauge_end) -> Episode:
     start, end = (np.stack([levels[s], g, swirls[s]], axis=1) for s, g in ((slice(0, -1), gauge_start), (slice(1, None), gauge_end)))
     return Episode(
         1.0, ("inflow",), OUTPUTS, ("",), ("",) * 3, MODEL.state_names, np.arange(count) * 1.0, inflow[:, None], start, end,
-        np.stack([levels, swirls], axis=1)[:-1], np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count, dtype=np.int64), Ending.DONE,
+        np.stack([levels, swirls], axis=1)[:-1], np.zeros(count, dtype=np.int64), np.zeros(count),
+        np.zeros(count, dtype=np.int64), Ending.DONE,
     )  # fmt: skip
 
 
@@ -143,11 +144,11 @@ class ToyLoop:
 
 @dataclass(frozen=True)
 class Plant:
-    """What is truly there; ``extra`` maps (level, inflow) to what no twin of this model has in its gauge."""
+    """What is truly there; ``unmodelled`` maps (level, inflow) to what no twin of this model has in its gauge."""
 
     factors: tuple[float, float, float] = (1.5, 1.3, 1.4)
     gain: float = 0.13
-    extra: Callable[[Any, Any], Any] | None = None
+    unmodelled: Callable[[Any, Any], Any] | None = None
     noise: float = NOISE
     start: float = 0.0
 
@@ -162,7 +163,7 @@ class Plant:
         for k in range(n):
             one = episode_of(*(part[k] for part in loops))
             for side in (one.output_start, one.output_end):
-                side[:, 1] += 0.0 if self.extra is None else self.extra(side[:, 0], one.input[:, 0])
+                side[:, 1] += 0.0 if self.unmodelled is None else self.unmodelled(side[:, 0], one.input[:, 0])
                 side[:, 1] += 0.0 if seed is None else self.noise * draw.standard_normal(len(side))
             out.append(one)
         return out

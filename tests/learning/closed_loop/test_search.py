@@ -98,7 +98,7 @@ def test_merit_tells_a_broken_limit_from_a_slow_charge():
 @pytest.mark.parametrize("extra", [None, structural], ids=["of the model", "structural"])
 def test_on_a_true_plant_it_finds_what_differential_evolution_finds(extra):
     """A loop that rides its limit at most samples: thousands of evaluations of another, global solver."""
-    plant, simulated = Plant(extra=extra), []
+    plant, simulated = Plant(unmodelled=extra), []
 
     def simulate(thetas):
         simulated.extend(thetas)

@@ -49,7 +49,7 @@ def checked(plant, levels, following, floor=1e-3):
 
 
 def test_the_scale_grows_with_what_was_not_predicted():
-    right, wrong = (checked(plant, (3.0,), 1.6) for plant in (Plant(), Plant(extra=structural)))
+    right, wrong = (checked(plant, (3.0,), 1.6) for plant in (Plant(), Plant(unmodelled=structural)))
     medians = [calibrate_scales([one], 1.0, 1)[0] for one in (right, wrong)]
     assert medians[0] < 1.5 < medians[1]
     assert right.standardised_error < 2.0 < wrong.standardised_error
@@ -57,14 +57,14 @@ def test_the_scale_grows_with_what_was_not_predicted():
 
 def test_a_repeat_says_nothing_of_elsewhere():
     """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
-    check = checked(Plant(extra=structural), (3.0, 1.6), 1.6)
+    check = checked(Plant(unmodelled=structural), (3.0, 1.6), 1.6)
     assert check.standardised_error < 1.5
     found = calibrate_scales([check], 1.0, 5)
     np.testing.assert_allclose(found, calibrate_scales((), 1.0, 5), rtol=0.25)
 
 
 def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
-    plant = Plant(extra=structural)
+    plant = Plant(unmodelled=structural)
     trials = [plant.trial(k, np.full(3, level)) for k, level in enumerate((3.0, 1.6, 1.6, 1.6, 1.6, 1.6))]
     scales = [calibrate_scales(condition(ToyLoop(), trials[:n]).checks, 1.0, 1)[0] for n in (2, 6)]
     assert scales[0] > 1.5

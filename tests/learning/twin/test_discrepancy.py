@@ -15,7 +15,7 @@ from chargetune.learning.twin.settings import TwinSettings
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
-WRONG = Plant(extra=structural)
+WRONG = Plant(unmodelled=structural)
 WITH_SWIRL = ToyLoop(noise_sd={"gauge": NOISE, "swirl": NOISE}, discrepancy_sd_floor={"gauge": 1e-3, "swirl": 1e-3})
 
 

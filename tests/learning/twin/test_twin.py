@@ -58,7 +58,7 @@ def test_several_episodes_and_several_unknowns_at_once_are_as_one_after_the_othe
 @pytest.mark.parametrize("discrepancy", [False, True])
 def test_covariance_is_that_of_dense_algebra_with_the_spread_that_is_stated(discrepancy):
     """(J'J / spread^2 + S^-1)^-1 with J by finite differences, on a plant that the twin cannot be."""
-    episode, twin = Plant(extra=structural).episode(SPACE.upper, 3), ToyLoop().twin
+    episode, twin = Plant(unmodelled=structural).episode(SPACE.upper, 3), ToyLoop().twin
     posterior = fit(twin, [episode], discrepancy=discrepancy)
     inputs, mode = episode.input, posterior.mode
     columns = [(predict(twin, mode + h, inputs) - predict(twin, mode - h, inputs)).ravel() / 2e-5 for h in 1e-5 * np.eye(4)]
@@ -88,7 +88,7 @@ def test_the_squares_are_those_of_all_samples():
 def test_a_fit_that_begins_at_another_ends_where_it_would_by_itself(extra):
     """Within a small part of a standard deviation, and it is as wide."""
     twin = ToyLoop().twin
-    episodes = [Plant(extra=extra).episode(np.full(3, level), k) for k, level in enumerate((3.0, 2.0, 1.7, 1.5))]
+    episodes = [Plant(unmodelled=extra).episode(np.full(3, level), k) for k, level in enumerate((3.0, 2.0, 1.7, 1.5))]
     alone = fit(twin, episodes)
     along = fit(twin, episodes, start=fit(twin, episodes[:3]))
     np.testing.assert_allclose(along.spread, alone.spread, rtol=0.05)
@@ -151,7 +151,7 @@ def test_where_the_record_of_the_input_ends_nothing_is_predicted_and_nothing_is_
 
 def test_what_the_model_cannot_represent_is_a_discrepancy():
     twin, episode = ToyLoop().twin, Plant().episode(SPACE.upper, 0)
-    wrong = Plant(extra=lambda level, inflow: 0.01 * np.sin(40 * level)).episode(SPACE.upper, 0)
+    wrong = Plant(unmodelled=lambda level, inflow: 0.01 * np.sin(40 * level)).episode(SPACE.upper, 0)
     assert fit(twin, [wrong]).discrepancy_sd[0] > 0.004
     assert fit(twin, [episode]).discrepancy_sd[0] < 0.001
 
