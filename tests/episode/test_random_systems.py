@@ -159,6 +159,7 @@ def test_virtual_machine(drawn, same):
         same(whole, by_ipopt, 1e-5)
 
 
+@pytest.mark.compiled_code
 @pytest.mark.parametrize("drawn", COMPILED)
 def test_compiled(drawn, same):
     """Another start of the QP solver and fused multiplications: each within the solver's tolerance of 1e-9, which the loop adds up."""
