@@ -150,7 +150,7 @@ def closed_loops(drawn: Drawn, *, compiled: bool):
 @given(drawn=DRAWN)
 @example(drawn=SMALLEST)
 @example(drawn=LARGEST)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_virtual_machine(drawn, same):
     """The same functions called one by one: only the plant's sums are taken in another order."""
     whole, single, by_ipopt = closed_loops(drawn, compiled=False)
