@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-# Lint, types and imports beside each other.
+# Two at a time: mypy uses one core and runs beside the tests.
 MAKEFLAGS += --jobs=2
 
 PYTHON ?= python3
@@ -14,10 +14,10 @@ READY := .venv/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 LOCK_VENV := build/lock-venv
 
-.PHONY: help setup demo test lint types imports bench lock clean
+.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
 
 # --no-compile: what is imported is compiled then, and most modules of the packages never are.
 setup: $(READY) ## make .venv with the locked versions
@@ -33,7 +33,17 @@ $(READY): requirements.lock pyproject.toml
 demo: $(READY) ## tune a fast-charging controller and draw the figures, into out/demo
 	$(BIN)/chargetune tune examples/fast_charge.toml --out out/demo
 
-test: lint types imports ## every check, then every test
+test: lint types tests imports ## every check and every test
+
+tests: $(READY) ## the tests alone
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-flags: export CHARGETUNE_CFLAGS := -O1
+test-flags: $(READY) ## the tests, episodes compiled with -O1 for any processor of this kind
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-vm: export CHARGETUNE_CC := none
+test-vm: $(READY) ## the tests without a C compiler
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: $(READY) ## ruff: rules and format

@@ -12,9 +12,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Before the first import of numpy or torch: parallel_map test process has one core, and more threads would only fight for it.
+# Before the first import of numpy or torch: a test process has one core, and more threads would only fight for it.
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+# Half the time of compiling. Tests that are about compiled code have the flags of a user (marker `compiled_code`).
+TEST_FLAGS = "-O1 -march=native"
+os.environ.setdefault("CHARGETUNE_CFLAGS", TEST_FLAGS)
 
 # The fixtures of small closed loops are importable by name.
 sys.path.insert(0, str(Path(__file__).parent))
@@ -102,6 +106,18 @@ def shared() -> Path:
     folder = Path(__file__).resolve().parents[2] / "shared"
     assert folder.is_dir(), f"{folder} is missing: the reference data belongs beside the checkout"
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _compiled_code(request, monkeypatch):
+    """Tests marked `compiled_code` have the flags that a user has, unless the whole run was asked for others, and need a compiler."""
+    if request.node.get_closest_marker("compiled_code"):
+        from chargetune.runtime.compiler import find_compiler
+
+        if find_compiler() is None:
+            pytest.skip("about compiled code, and there is no C compiler, or CHARGETUNE_CC says so")
+        if os.environ["CHARGETUNE_CFLAGS"] == TEST_FLAGS:
+            monkeypatch.delenv("CHARGETUNE_CFLAGS")
 
 
 @pytest.fixture

@@ -4,22 +4,11 @@ import json
 
 import pytest
 
+from study_text import study_text
+
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
-STUDY = """
-[study]
-name = "NAME"
-tuner = "sobol"
-trials = 2
-[controller]
-mismatch_seed = 1
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+STUDY = study_text(study={"name": "NAME", "trials": 2}, controller={"mismatch_seed": 1})
 
 
 @pytest.fixture

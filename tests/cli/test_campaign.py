@@ -8,23 +8,12 @@ import pytest
 from commands import chargetune
 
 from chargetune.battery.studies.campaign import load_campaign
+from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-STUDY = """
-[study]
-tuner = "sobol"
-trials = 3
-[controller]
-mismatch_seed = 1
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+STUDY = study_text(study={"trials": 3}, controller={"mismatch_seed": 1})
 
 
 def test_table_resume_and_json(tmp_path):

@@ -5,36 +5,25 @@ from pathlib import Path
 
 import pytest
 
+from study_text import study_text
+
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
-STUDY = """
-[study]
-name = "quick"
-tuner = "sobol"
-trials = 6
-[controller]
-mismatch_seed = 1
-{controller}
-[episode]
-steps = 100
-soc_start = 0.4
-soc_target = 0.8
-[sensors]
-voltage_noise_sd_V = 0.001
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+STUDY = study_text(
+    study={"name": "quick", "trials": 6},
+    controller={"mismatch_seed": 1},
+    episode={"steps": 100, "soc_start": 0.4, "soc_target": 0.8},
+    sensors={"voltage_noise_sd_V": 0.001},
+)
 
 
 @pytest.fixture
 def study(tmp_path):
     def write(controller=""):
         path = tmp_path / "study.toml"
-        path.write_text(STUDY.format(controller=controller))
+        path.write_text(STUDY.replace("[controller]", f"[controller]\n{controller}"))
         return path
 
     return write
@@ -64,7 +53,7 @@ def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune_here, stu
 
 def test_a_warning_is_no_failure_and_entries_are_printed_with_their_brackets(chargetune_here, tmp_path):
     path = tmp_path / "s.toml"
-    path.write_text(STUDY.format(controller="").split("[theta")[0] + "[theta.current_limit]\n")
+    path.write_text(STUDY.replace("[theta.backoff]\nnodes = 3\nlower_V = 0.0\nupper_V = 0.2\n", "[theta.current_limit]\n"))
     code, out, _ = chargetune_here("check", path)
     assert code == 0
     assert "current_limit[0]" in out

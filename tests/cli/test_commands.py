@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from commands import chargetune
 
+from study_text import study_text
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 
@@ -22,20 +24,7 @@ def write(folder, text, name="study.toml"):
     return path
 
 
-QUICK = """
-[study]
-name = "quick"
-tuner = "sobol"
-trials = 6
-[controller]
-mismatch_seed = 1
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"name": "quick", "trials": 6}, controller={"mismatch_seed": 1})
 
 
 @pytest.fixture(scope="module")

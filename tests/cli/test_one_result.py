@@ -19,30 +19,18 @@ from chargetune.study.store.store import Store
 from chargetune.study.trial import best_feasible
 from chargetune.web.events import study_events
 from chargetune.web.watch import StoreWatch
+from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 NAME = "study seed 0"
-STUDY = f"""
-[study]
-name = "{NAME}"
-tuner = "sobol"
-trials = 6
-[controller]
-mismatch_seed = 1
-[episode]
-steps = 100
-soc_start = 0.4
-soc_target = 0.8
-[limits]
-tolerance_V = 0.03
-[sensors]
-voltage_noise_sd_V = 0.001
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+STUDY = study_text(
+    study={"name": NAME, "trials": 6},
+    controller={"mismatch_seed": 1},
+    episode={"steps": 100, "soc_start": 0.4, "soc_target": 0.8},
+    limits={"tolerance_V": 0.03},
+    sensors={"voltage_noise_sd_V": 0.001},
+)
 CAMPAIGN = """
 [campaign]
 configs = ["study.toml"]

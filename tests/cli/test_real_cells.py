@@ -9,6 +9,7 @@ from commands import chargetune
 
 from chargetune.battery.cell.cell import load_cell
 from chargetune.battery.studies.study_file import load_config
+from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -51,20 +52,7 @@ def test_identify_refuses_what_holds_no_circuit(shared, tmp_path, refused):
     assert not (tmp_path / "cell.toml").exists()
 
 
-QUICK = """
-[study]
-name = "quick"
-tuner = "sobol"
-trials = 5
-[controller]
-mismatch_seed = 1
-[episode]
-steps = 200
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"name": "quick", "trials": 5}, controller={"mismatch_seed": 1}, episode={"steps": 200})
 
 
 def test_compare_prints_the_table_draws_and_takes_the_tuned_controller(tmp_path):

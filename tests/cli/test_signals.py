@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import told
+from commands import chargetune, told
 
 from chargetune.battery.cell.cell import load_cell
 from chargetune.battery.charging.problem import Backoff, ChargingProblem
@@ -19,17 +19,9 @@ from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.learning import Sobol
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
+from study_text import study_text
 
-CONFIG = """
-[study]
-name = "stopped"
-tuner = "sobol"
-trials = 100000
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+CONFIG = study_text(study={"name": "stopped", "trials": 100_000}, episode={"steps": 120})
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -53,7 +45,7 @@ def test_the_command_stops_and_resumes(tmp_path, number):
     with Store(tmp_path / "s.db") as store:
         trials = store.trials(1)
     assert {t.status for t in trials} <= {"done", "running"}
-    again = subprocess.run([*command, "--trials", str(len(trials) + 1), "--json"], capture_output=True, text=True, check=True)
+    again = chargetune(*command[3:], "--trials", len(trials) + 1, "--json")
     found = json.loads(again.stdout)
     assert (found["trials"], found["failed"]) == (len(trials) + 1, 0)
 

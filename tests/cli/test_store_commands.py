@@ -11,21 +11,11 @@ import pytest
 
 from chargetune.cli import main
 from chargetune.study.store.salvage import salvage
+from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
-QUICK = """
-[study]
-name = "red quick"
-tuner = "sobol"
-trials = 4
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"name": "red quick", "trials": 4})
 OLD = Path(__file__).parents[1] / "study" / "store" / "data" / "schema-1.db"
 
 

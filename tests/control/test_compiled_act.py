@@ -13,6 +13,7 @@ from chargetune.plants.simulated import SimulatedPlant
 KALMAN = ExtendedKalman(measured=("position",), measurement_sd=(0.01,), process_sd=(0.001, 0.01), start_sd=(0.1, 0.1))
 
 
+@pytest.mark.compiled_code
 @pytest.mark.parametrize("settings", [{}, {"estimator": KALMAN}, {"limits": [SoftLimit("speed", upper=0.25, at="end")]}])
 def test_the_same_closed_loop(settings):
     own, plant = controller("l", **settings), SimulatedPlant(plant_model(), {})
@@ -21,6 +22,7 @@ def test_the_same_closed_loop(settings):
         np.testing.assert_allclose(getattr(loops[0], name), getattr(loops[1], name), atol=1e-6)
 
 
+@pytest.mark.compiled_code
 def test_another_theta_is_another_controller():
     own, plant = controller("U"), SimulatedPlant(plant_model(), {})
     step = compiled_act(own)

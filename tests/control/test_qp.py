@@ -12,6 +12,8 @@ from chargetune.control.qp import daqp, daqp_warm
 SLACKS, VARIABLES, ROWS = 2, 5, 12
 N, DUALS = SLACKS + VARIABLES, SLACKS + ROWS
 NOTHING = np.zeros(DUALS)
+# All but DAQP's own interface is C that this project compiles.
+pytestmark = pytest.mark.compiled_code
 
 
 def random_qp(rng, kind):
@@ -29,7 +31,7 @@ def random_qp(rng, kind):
     return g, a.T, low, high
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def solvers():
     return daqp(SLACKS, VARIABLES, ROWS), daqp_warm(SLACKS, VARIABLES, ROWS)
 

@@ -26,6 +26,13 @@ WAYS = {
 BY_IPOPT = ("seed0-backoff", "seed0-model-U1")
 
 
+CASES = [
+    pytest.param(name, way, marks=[pytest.mark.compiled_code] if way == "compiled" else [])
+    for way in WAYS
+    for name in (BY_IPOPT if way == "IPOPT" else NAMES)
+]
+
+
 @pytest.fixture(scope="module")
 def cases(shared):
     return {case["name"]: case for case in json.loads((shared / "reference" / "p0.json").read_text())["cases"]}
@@ -41,7 +48,7 @@ def test_no_case_is_forgotten(cases):
     assert sorted(cases) == sorted(NAMES)
 
 
-@pytest.mark.parametrize(("name", "way"), [(name, way) for way in WAYS for name in (BY_IPOPT if way == "IPOPT" else NAMES)])
+@pytest.mark.parametrize(("name", "way"), CASES)
 def test_trajectory(name, way, cases):
     case = cases[name]
     problem = problem_of_case(case)

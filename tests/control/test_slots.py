@@ -9,6 +9,7 @@ from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
 
 STEPS = 20
+COMPILED = pytest.mark.compiled_code
 
 
 def loop(slot, t, compiled):
@@ -16,14 +17,14 @@ def loop(slot, t, compiled):
 
 
 # What a slot does is decided before the loop is compiled: one compilation shows that nothing is lost there.
-@pytest.mark.parametrize(("slot", "compiled"), [*((slot, False) for slot in SLOTS), ("l", True)])
+@pytest.mark.parametrize(("slot", "compiled"), [*((slot, False) for slot in SLOTS), pytest.param("l", True, marks=COMPILED)])
 def test_theta_in_this_slot_changes_the_loop(slot, compiled):
     untuned, tuned = loop(slot, 1.0, compiled), loop(slot, 0.7, compiled)
     assert np.max(np.abs(tuned - untuned)) > 1e-3
     np.testing.assert_array_equal(loop(slot, 1.0, compiled), untuned)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=COMPILED), False])
 def test_theta_left_out_leaves_the_loop_bit_identical(compiled):
     untuned = loop(None, 1.0, compiled)
     for t in (0.5, 0.7, 2.0):

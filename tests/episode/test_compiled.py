@@ -58,6 +58,7 @@ def test_virtual_machine_and_step_by_step(charging, same, name):
     assert (whole.ending, len(whole), whole.failures) == (Ending.DONE, 120, 0)
 
 
+@pytest.mark.compiled_code
 @pytest.mark.parametrize("name", ["all of these", "exact state", "Kalman filter, delay 1"])
 def test_compiled_and_step_by_step(charging, same, name):
     controller, plant = loop(charging, name)
@@ -191,6 +192,7 @@ def fresh(**environment):
     return done.stdout.split()
 
 
+@pytest.mark.compiled_code
 def test_a_fresh_process_loads_what_was_compiled_before(tmp_path):
     log, wrapper, cache = tmp_path / "calls", tmp_path / "counting-cc", tmp_path / "cache"
     wrapper.write_text(f'#!/bin/sh\necho called >> "{log}"\nexec "{find_compiler()}" "$@"\n')
@@ -245,6 +247,7 @@ def test_insisting_without_a_compiler(tank_controller, tank_plant, monkeypatch):
         compiled_episode(tank_controller(), tank_plant(), 19, compiled=True)
 
 
+@pytest.mark.compiled_code
 def test_a_cache_that_cannot_be_written(tank_controller, tank_plant, monkeypatch, tmp_path):
     blocked = tmp_path / "a file"
     blocked.write_text("")
@@ -255,7 +258,7 @@ def test_a_cache_that_cannot_be_written(tank_controller, tank_plant, monkeypatch
         compiled_episode(tank_controller(), tank_plant(), 20, compiled=True)
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="an ensemble shares the cores where its loop is compiled")
+@pytest.mark.compiled_code
 @pytest.mark.parametrize("count", [1, 5, 37])
 def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
     controller, plant = loop(charging, "all of these")
@@ -273,8 +276,10 @@ def test_an_ensemble_is_one_loop_after_the_other(charging, same, count):
 LATTICE = LookupTable.over({"soc": (0.0, 1.0), "current_A": (-1.0, 12.0)}, ["voltage_V", "soc"])
 
 
-@pytest.mark.parametrize("compiled", [None, False])
-@pytest.mark.parametrize("name", ["ideal", "noise", "Kalman filter, delay 1"])
+# Compiled once: the loop that has everything in it.
+@pytest.mark.parametrize(
+    ("name", "compiled"), [("ideal", False), ("noise", False), ("Kalman filter, delay 1", False), ("Kalman filter, delay 1", None)]
+)
 def test_a_constant_table_is_the_bias_of_a_sensor(charging, name, compiled):
     controller, plant = loop(charging, name)
     off = {"voltage_V": 4e-3, "soc": 0.01}
@@ -289,11 +294,13 @@ def test_a_constant_table_is_the_bias_of_a_sensor(charging, name, compiled):
         np.testing.assert_allclose(mine, other, rtol=0, atol=1e-6)
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_without_a_table_a_lattice_changes_nothing(charging, same):
     controller, plant = loop(charging, "Kalman filter, delay 1")
     same(compiled_episode(controller, plant, 40, lookup_table=LATTICE).run(THETA, 3), compiled_episode(controller, plant, 40).run(THETA, 3))
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_what_is_measured_is_the_truth_and_the_table_there(charging):
     controller, plant = loop(charging, "ideal")
     table = np.random.default_rng(0).normal(0.0, 3e-3, (2, LATTICE.size))
@@ -308,6 +315,7 @@ def test_what_is_measured_is_the_truth_and_the_table_there(charging):
             np.testing.assert_allclose(measured[:, column] - true[:, column], added, rtol=0, atol=1e-12)
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_an_ensemble_refuses_what_does_not_belong_to_it(charging):
     controller, plant = loop(charging, "ideal")
     episodes = compiled_episode(controller, plant, 10)

@@ -150,7 +150,7 @@ def closed_loops(drawn: Drawn, *, compiled: bool):
 @given(drawn=DRAWN)
 @example(drawn=SMALLEST)
 @example(drawn=LARGEST)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_virtual_machine(drawn, same):
     """The same functions called one by one: only the plant's sums are taken in another order."""
     whole, single, by_ipopt = closed_loops(drawn, compiled=False)
@@ -159,6 +159,7 @@ def test_virtual_machine(drawn, same):
         same(whole, by_ipopt, 1e-5)
 
 
+@pytest.mark.compiled_code
 @pytest.mark.parametrize("drawn", COMPILED)
 def test_compiled(drawn, same):
     """Another start of the QP solver and fused multiplications: each within the solver's tolerance of 1e-9, which the loop adds up."""

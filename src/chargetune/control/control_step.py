@@ -16,7 +16,7 @@ from chargetune.control.ocp import Problem, control_problem
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.control.sqp import SolveStatus, cold, solver
 from chargetune.runtime.cache import cached
-from chargetune.runtime.compiler import compile_library, find_compiler
+from chargetune.runtime.compiler import compile_library, compiler_flags, find_compiler
 from chargetune.runtime.split import split
 
 __all__ = ["Act", "Info", "Memory", "act", "begin", "compiled_act", "control_step", "problem_of"]
@@ -95,7 +95,7 @@ def compiled_act(controller: Controller) -> Act:
         return act
     problem = problem_of(controller)
     try:
-        function = cached(f"compiled step {controller.structure}", lambda: _machine_code(problem))
+        function = cached(f"compiled step {controller.structure} {compiler_flags()}", lambda: _machine_code(problem))
     except (RuntimeError, OSError) as error:
         warnings.warn(f"the controller runs on the virtual machine, several times slower: {error}", RuntimeWarning, stacklevel=2)
         return act

@@ -25,7 +25,7 @@ from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.stepwise import check_run, signal_indices
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 from chargetune.runtime.cache import cached
-from chargetune.runtime.compiler import compile_library, find_compiler
+from chargetune.runtime.compiler import compile_library, compiler_flags, find_compiler
 from chargetune.runtime.numpy_call import numpy_call
 from chargetune.runtime.split import split
 from chargetune.runtime.threads import parallel_map
@@ -177,7 +177,7 @@ def compiled_episode(
     # A lookup_table finds the outputs by name.
     own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.model.output_names} {plant.sensors.delay_steps}"
     use = find_compiler() is not None if compiled is None else compiled
-    key = f"episode {controller.structure} {own} {steps} {use} {compiled is None} {indices} {lookup_table}"
+    key = f"episode {controller.structure} {own} {steps} {use and compiler_flags()} {compiled is None} {indices} {lookup_table}"
 
     def build() -> tuple[ca.Function, ca.Function, bool]:
         try:

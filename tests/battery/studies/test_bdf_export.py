@@ -18,18 +18,9 @@ from chargetune.study.store.store import Store, StoreError
 from chargetune.study.store.trace import encode
 from chargetune.study.study import Study
 from chargetune.study.warm_start import Earlier
+from study_text import study_text
 
-QUICK = """
-[study]
-name = "quick"
-tuner = "sobol"
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"name": "quick"})
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgres"])

@@ -8,19 +8,9 @@ from chargetune.battery.studies.campaign import load_campaign, run_campaign
 from chargetune.battery.studies.open_study import open_study
 from chargetune.study.executors import process_executor
 from chargetune.study.store.store import Store
+from study_text import study_text
 
-QUICK = """
-[study]
-tuner = "sobol"
-trials = 9
-batch = 2
-[episode]
-steps = 60
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"trials": 9, "batch": 2})
 CAMPAIGN = """
 [campaign]
 configs = ["a.toml", "b.toml"]
@@ -33,7 +23,7 @@ mismatch_from_seed = true
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "a.toml").write_text(QUICK)
-    (tmp_path / "b.toml").write_text(QUICK.replace("batch = 2", "").replace("60", "40"))
+    (tmp_path / "b.toml").write_text(QUICK.replace("batch = 2", "").replace("60", "120"))
     (tmp_path / "c.toml").write_text(CAMPAIGN)
     return tmp_path
 

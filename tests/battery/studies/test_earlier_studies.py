@@ -6,20 +6,11 @@ from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import load_config
 from chargetune.study.store.store import Store
 from chargetune.study.warm_start import Earlier
+from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
-QUICK = """
-[study]
-name = "NAME"
-tuner = "sobol"
-[episode]
-steps = 30
-[theta.backoff]
-nodes = 3
-lower_V = 0.0
-upper_V = 0.2
-"""
+QUICK = study_text(study={"name": "NAME"}, episode={"steps": 30})
 KEY = """
 [[study.earlier]]
 store = "old.sqlite"

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import text
 from study_toy import SPACE, Halfway, Toy, essence, open_study
 
+from chargetune.study.store import damaged_reader
 from chargetune.study.store.integrity import check_store
 from chargetune.study.store.salvage import salvage
 from chargetune.study.store.store import Store, StoreError
@@ -165,6 +166,11 @@ def test_a_target_with_studies_is_refused(filled, tmp_path):
 @pytest.mark.parametrize("location", ["sqlite"], indirect=True)
 class TestFile:
     """Bytes of the file itself are damaged; a server looks after its own."""
+
+    @pytest.fixture(autouse=True)
+    def stray(self, monkeypatch):
+        """Rows are looked for until so many numbers in a row have none; the last row here has the number 82."""
+        monkeypatch.setattr(damaged_reader, "STRAY", 500)
 
     def ruin(self, path, kind):
         with closing(sqlite3.connect(path)) as connection:
