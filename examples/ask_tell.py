@@ -6,6 +6,8 @@ Here the charge is simulated; on a test bench `charge` would run the cycler. Run
 import sys
 
 from chargetune.battery.case_study.configurations import case_study
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.learning import ConstrainedLogEI
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
@@ -27,8 +29,8 @@ def main(trials, path):
                 break
             for trial in waiting:
                 try:
-                    episode = problem.episode(trial.theta, trial.seed)
-                    score = problem.score(episode)
+                    episode = run_charge(problem, trial.theta, trial.seed)
+                    score = score_episode(problem, episode)
                 except (RuntimeError, ValueError) as error:
                     study.fail(trial.number, str(error))
                     continue

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from chargetune.learning.candidate_choice import _Corrected, choose_candidate
 
 from chargetune.episode.score import Score
 from chargetune.learning.black_box.optimize_acquisition import reproducible
-from chargetune.learning.candidate_choice import _Corrected, choose_candidate
 from chargetune.learning.twin.ensemble import Prediction
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.evaluate import Evaluation, evaluate
 from chargetune.battery.charging.soc_windows import ChargingWindows
+from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning import Composite, IterativeLearning, Safety, TwinTuner
 from chargetune.learning.twin.ensemble import condition
-from chargetune.plants.sensors import Sensors
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
+from charging_problems import charging_problem
 
 # 24 intervals near full, where the voltage limit is met.
-PROBLEM = ChargingProblem(
-    default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0, scale=True),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
+PROBLEM = charging_problem(
+    default_cell(), mismatch_seed=1, R0=ResistanceRatio(0.1, 4.0, scale=True), voltage_noise_sd_V=0.002,
     soc_start=0.7, steps=24, verdict_samples=3,
 )  # fmt: skip
 # By tuner the trials of the whole study, and how many there are when it is interrupted: enough that it has learnt.
@@ -37,7 +38,7 @@ def go_on(path, name, count):
         Store(path) as store,
         Study.create_or_resume(store, name, config={}, space=PROBLEM.space, tuner=TUNERS[name][0](), seed=5) as study,
     ):
-        study.run(PROBLEM, count)
+        study.run(Evaluation(PROBLEM), count)
         return [(t.theta, t.trace_sha256) for t in study.trials()]
 
 
@@ -47,8 +48,9 @@ def test_a_study_that_was_interrupted_ends_as_one_that_was_not(name, tmp_path, m
     _, whole, part = TUNERS[name]
     uninterrupted = go_on(tmp_path / "whole.db", name, whole)
     assert go_on(tmp_path / "part.db", name, part) == uninterrupted[:part]
-    code = f"import sys; sys.path.insert(0, sys.argv[1]); from test_resume import go_on; go_on(sys.argv[2], {name!r}, {whole})"
-    subprocess.run([sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path / "part.db")], check=True)
+    code = f"import sys; sys.path[:0] = sys.argv[1:3]; from test_resume import go_on; go_on(sys.argv[3], {name!r}, {whole})"
+    folders = [str(folder) for folder in Path(__file__).parents[:2]]
+    subprocess.run([sys.executable, "-c", code, *folders, str(tmp_path / "part.db")], check=True)
     assert go_on(tmp_path / "part.db", name, whole) == uninterrupted
     # It learns: not all trials are one.
     assert len({theta for theta, _ in uninterrupted}) > 1
@@ -59,7 +61,7 @@ def test_what_a_twin_remembers_changes_nothing_that_it_says():
     """After more trials than it learns from, and after another study's have gone through the same twin."""
     trials = []
     for number, level in enumerate((4.0, 2.5, 2.0, 1.7, 1.6, 1.5)):
-        score, episode, _ = PROBLEM(np.array([level]), number)
+        score, episode, _ = evaluate(PROBLEM, np.array([level]), number)
         trials.append(Told(number, (level,), score, episode))
     used = ChargingTwin(PROBLEM)
     for n in (1, 2, 3, 4, 5, 6):

@@ -5,33 +5,34 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from chargetune.learning.closed_loop.nearest_theta import nearest
 from scipy.stats import norm
 from two_pairs import AnotherCell, TwoPairs
 
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.tunables import LimitBackoff
+from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.charging.settings import SensorSettings
+from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.charging.verdict import score_episode, violation_mVs
 from chargetune.episode.episode import Ending
 from chargetune.learning import NoSafeThetaError, Safety, TwinTuner
 from chargetune.learning import safe_mode as safe_ask
 from chargetune.learning.candidates import Proposal
 from chargetune.learning.closed_loop.loop import windows_of
-from chargetune.learning.closed_loop.nearest_theta import nearest
 from chargetune.learning.safe_mode import SafeProposal
 from chargetune.learning.twin.calibration import SCALES
 from chargetune.learning.twin.ensemble import condition
-from chargetune.plants.sensors import Sensors
+from charging_problems import changed, charging_problem
 
 CELL = default_cell()
 
 
 def charge(seed=1, noise=0.002, **changes):
-    sensors = Sensors(noise_sd={"voltage_V": noise}) if noise else Sensors()
-    parts = {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)} | changes
-    return ChargingProblem(CELL, mismatch_seed=seed, sensors=sensors, verdict_samples=5, **parts)
+    parts = {"R0": ResistanceRatio(0.1, 4.0)} | changes
+    return charging_problem(CELL, mismatch_seed=seed, voltage_noise_sd_V=noise, verdict_samples=5, **parts)
 
 
 def told(number, theta, score, episode):
@@ -40,12 +41,12 @@ def told(number, theta, score, episode):
 
 def learn(problem, tuner, count):
     """(trials, true excess in mV, t95 in min) of ``count`` trials."""
-    exact, trials, excess, minutes = replace(problem, sensors=Sensors()), [], [], []
+    exact, trials, excess, minutes = changed(problem, sensors=SensorSettings()), [], [], []
     for number in range(count):
         theta = tuner.ask(problem.space, trials)[0]
-        score, episode, _ = problem(theta, number)
+        score, episode, _ = evaluate(problem, theta, number)
         trials.append(told(number, theta, score, episode))
-        metrics = exact.score(exact.episode(theta)).metrics
+        metrics = score_episode(exact, run_charge(exact, theta)).metrics
         excess.append(metrics["overshoot_mV"])
         minutes.append(metrics["t95_min"] or np.inf)
     return trials, excess, minutes
@@ -62,7 +63,7 @@ def test_three_trials_and_none_breaks_the_limit():
 
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
-    problem = charge(plant_model=TwoPairs(CELL))
+    problem = charge(plant=TwoPairs(CELL))
     _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
     assert max(excess) <= 5.0
     assert excess[-1] <= 2.0
@@ -81,7 +82,7 @@ def test_nothing_is_risked_for_nothing(seed, monkeypatch):
 
     monkeypatch.setattr(safe_ask, "nearest", noted)
     start = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
-    problem = charge(seed, ratios=(), backoff=start, charge_time_to_soc=0.6)
+    problem = charge(seed, R0=None, backoff=start, charge_time_to_soc=0.6)
     trials, excess, _ = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(start=(0.3,) * 11)), 3)
     theta = np.array(trials[-1].theta)
     assert max(excess) <= 1.0
@@ -104,10 +105,10 @@ def test_temperature_and_anode_potential_are_kept_while_learning():
         anode=Anode((0.0, 0.5, 1.0), (0.25, 0.06, 0.04), (0.02, 0.02, 0.025)),
     )
     believed = replace(true, anode=Anode((0.0, 0.5, 1.0), (0.26, 0.07, 0.05), (0.016, 0.016, 0.02)))
-    problem = ChargingProblem(
-        believed, mismatch_seed=1, plant_model=AnotherCell(true), sensors=Sensors(noise_sd={"voltage_V": 2e-3}), verdict_samples=5,
+    problem = charging_problem(
+        believed, mismatch_seed=1, plant=AnotherCell(true), voltage_noise_sd_V=2e-3, verdict_samples=5,
         backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3), temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8,
-        limit_backoffs=(LimitBackoff("temperature", -5.0, 5.0), LimitBackoff("anode", -0.05, 0.05, nodes=4)),
+        temperature_backoff=LimitBackoff(-5.0, 5.0), anode_backoff=LimitBackoff(-0.05, 0.05, nodes=4),
     )  # fmt: skip
     loop = ChargingTwin(problem)
     assert set(loop.twin.noise_sd) == {"voltage_V", "temperature_K", "anode_potential_V"}
@@ -125,7 +126,7 @@ def test_the_first_theta_is_the_declared_one_or_the_corner_that_is_safe():
     declared = tuple(np.full(9, 2.5))
     np.testing.assert_array_equal(TwinTuner(ChargingTwin(problem), safety=Safety(start=declared)).ask(problem.space, [], 2), [declared] * 2)
     # A backoff of at most 50 mV cannot cover what the prior allows.
-    narrow = ChargingProblem(CELL, mismatch_seed=1, backoff=Backoff(nodes=5, lower_V=0.0, upper_V=0.05))
+    narrow = charging_problem(CELL, mismatch_seed=1, backoff=Backoff(nodes=5, lower_V=0.0, upper_V=0.05))
     with pytest.raises(NoSafeThetaError, match=r"no corner .* probability 0\.95"):
         TwinTuner(ChargingTwin(narrow), safety=Safety()).ask(narrow.space, [])
     with pytest.raises(ValueError, match=r"R0_ratio\[0\] = 9"):
@@ -155,9 +156,9 @@ def test_a_safe_batch_is_of_different_thetas_that_all_passed():
 
 def test_a_spent_budget_stops_before_anything_is_proposed():
     problem = charge(noise=0.0)
-    score, episode, _ = problem(problem.space.default, 0)
-    spent = problem.violation_mVs(episode)
-    beyond = np.maximum(*episode.signal("voltage_V")) - problem.voltage_max_V - problem.tolerance_V
+    score, episode, _ = evaluate(problem, problem.space.default, 0)
+    spent = violation_mVs(problem, episode)
+    beyond = np.maximum(*episode.signal("voltage_V")) - problem.voltage_max_V - problem.limits.tolerance_V
     assert spent == pytest.approx(1e3 * 10.0 * np.sum(np.maximum(beyond, 0.0)))
     trials = [told(0, problem.space.default, score, episode)]
     with pytest.raises(NoSafeThetaError, match="budget of violation is spent"):
@@ -168,12 +169,12 @@ def test_a_spent_budget_stops_before_anything_is_proposed():
 def test_without_an_improvement_the_theta_that_was_safe_is_proposed_again_and_said():
     problem = charge(noise=0.0)
     theta = np.full(9, 3.0)
-    score, episode, _ = problem(theta, 0)
+    score, episode, _ = evaluate(problem, theta, 0)
     loop, space = ChargingTwin(problem), problem.space
     ask = SafeProposal(loop, space, condition(loop, trials := [told(0, theta, score, episode)]), trials, 0, Safety(), steps=5)
     with pytest.warns(RuntimeWarning, match="no safe improvement is known"):
         np.testing.assert_array_equal(ask._tried(), theta)
-    unsafe, trace, _ = problem(problem.space.default, 0)
+    unsafe, trace, _ = evaluate(problem, problem.space.default, 0)
     trials = [told(0, problem.space.default, unsafe, trace)]
     with pytest.raises(NoSafeThetaError, match="nothing was proposed"):
         SafeProposal(loop, space, condition(loop, trials), trials, 0, Safety(), steps=5)._tried()
@@ -185,7 +186,7 @@ def test_a_trial_that_left_no_trace_does_not_have_the_start_judged_anew():
     lost = SimpleNamespace(number=0, theta=tuple(problem.space.upper), status="failed", score=None, episode=None)
     asks = [tuner._safe_ask(problem.space, trials, tuner.safety) for trials in ([], [lost])]
     assert [(ask.seed, ask.steps) for ask in asks] == [(3, 2), (3, 2)]
-    score, episode, _ = problem(problem.space.upper, 0)
+    score, episode, _ = evaluate(problem, problem.space.upper, 0)
     assert tuner._safe_ask(problem.space, [told(0, problem.space.upper, score, episode)], tuner.safety).seed != 3
 
 
@@ -193,7 +194,7 @@ def after_one_charge():
     """What is asked for after a charge with all nodes at 2.5, and that theta."""
     problem, theta = charge(noise=0.0), np.full(9, 2.5)
     loop = ChargingTwin(problem)
-    score, episode, _ = problem(theta, 0)
+    score, episode, _ = evaluate(problem, theta, 0)
     trials = [told(0, theta, score, episode)]
     return SafeProposal(loop, problem.space, condition(loop, trials), trials, 0, Safety(), steps=5), theta
 
@@ -228,7 +229,7 @@ def test_where_every_draw_keeps_a_limit_by_little_it_is_not_sure():
 
 
 def test_searches_lead_from_a_safe_theta_to_better_ones():
-    problem = charge(charge_time_to_soc=0.95, plant_model=TwoPairs(CELL))
+    problem = charge(charge_time_to_soc=0.95, plant=TwoPairs(CELL))
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     trials, _, _ = learn(problem, tuner, 3)
     ask = tuner._safe_ask(problem.space, trials, tuner.safety)
@@ -259,7 +260,7 @@ def test_the_nearest_theta_may_use_more_of_a_limit_nowhere_but_where_the_other_d
         return nearest(search, space, goal, theta, promised, allowed)
 
     monkeypatch.setattr(safe_ask, "nearest", noted)
-    problem = charge(charge_time_to_soc=0.95, plant_model=TwoPairs(CELL))
+    problem = charge(charge_time_to_soc=0.95, plant=TwoPairs(CELL))
     learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
     for windows, allowed in seen:
         # Where nothing is held back that is the aim, to rounding.
@@ -293,7 +294,7 @@ def unforeseen(problem):
     """Three trials whose voltages no circuit has."""
     trials = []
     for number, theta in enumerate((np.full(9, 3.0), np.full(9, 2.5), np.full(9, 2.0))):
-        score, episode, _ = problem(theta, number)
+        score, episode, _ = evaluate(problem, theta, number)
         wrong = episode.output_end.copy()
         wrong[:, 0] += 0.3 * np.sin(np.arange(len(episode)) / 25 + 2 * number)
         trials.append(told(number, theta, score, replace(episode, output_end=wrong, output_start=wrong)))
@@ -341,7 +342,7 @@ def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch
 
 def test_trials_of_another_cell_are_refused():
     problem = charge(noise=0.0)
-    score, episode, _ = problem(problem.space.upper, 0)
+    score, episode, _ = evaluate(problem, problem.space.upper, 0)
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     with pytest.raises(ValueError, match="trials of earlier studies"):
         tuner.ask(problem.space, [told(-1, problem.space.upper, score, episode)])
@@ -349,7 +350,7 @@ def test_trials_of_another_cell_are_refused():
 
 def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
     problem = charge(noise=0.0, abort_margin_V=0.02)
-    score, episode, ending = problem(problem.space.default, 0)
+    score, episode, ending = evaluate(problem, problem.space.default, 0)
     start, end = episode.signal("voltage_V")
     assert score is None
     assert episode.ending is Ending.LIMIT
@@ -358,7 +359,7 @@ def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
     # It is learnt from like any other trace.
     ensemble = condition(ChargingTwin(problem), [told(0, problem.space.default, None, episode)])
     assert ensemble.discrepancy is not None
-    whole = replace(problem, abort_margin_V=None).episode()
+    whole = run_charge(changed(problem, abort_margin_V=None))
     assert len(episode) < len(whole)
     np.testing.assert_array_equal(episode.input, whole.input[: len(episode)])
 
@@ -382,15 +383,15 @@ def test_nonsense_is_refused_by_name(make, said):
 def test_the_result_is_the_quickest_trial_that_truly_kept_the_limit():
     """Capacity, SOC at the start and OCV unknown: what the controller would do on each plant drawn says less than what it did."""
     ocv = tuple(v + 0.002 for v in CELL.ocv_V)
-    problem = charge(plant_model=AnotherCell(replace(CELL, capacity_Ah=1.03 * CELL.capacity_Ah, ocv_V=ocv)), charge_time_to_soc=0.95)
-    exact = replace(problem, sensors=Sensors())
+    problem = charge(plant=AnotherCell(replace(CELL, capacity_Ah=1.03 * CELL.capacity_Ah, ocv_V=ocv)), charge_time_to_soc=0.95)
+    exact = changed(problem, sensors=SensorSettings())
     tuner = TwinTuner(ChargingTwin(problem, capacity_spread=0.03, soc_spread=0.012, ocv_spread_V=0.003))
     trials, true = [], []
     for number, level in enumerate((4.0, 1.37, 1.38, 1.4, 1.42)):
         theta = np.full(9, level)
-        score, episode, _ = problem(theta, number)
+        score, episode, _ = evaluate(problem, theta, number)
         trials.append(told(number, theta, score, episode))
-        true.append(exact.score(exact.episode(theta)))
+        true.append(score_episode(exact, run_charge(exact, theta)))
     kept = [k for k, score in enumerate(true) if score.feasible]
     assert kept == [0, 3, 4]
     assert tuner.best(problem.space, trials) == max(kept, key=lambda k: true[k].objective) == 3
@@ -403,4 +404,4 @@ def test_the_result_is_the_quickest_trial_that_truly_kept_the_limit():
 
 def worst_mV(prediction, problem):
     """By plant, the largest excess over the voltage limit."""
-    return 1e3 * problem.tolerance_V * (1.0 + np.nanmax(prediction.excess, axis=1))
+    return 1e3 * problem.limits.tolerance_V * (1.0 + np.nanmax(prediction.excess, axis=1))

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from chargetune.learning.closed_loop.nearest_theta import GAIN, _LeastDistance, nearest
 from scipy.optimize import minimize
 
 from chargetune.episode.score import Score
-from chargetune.learning.closed_loop.nearest_theta import GAIN, _LeastDistance, nearest
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.closed_loop.slp import Linearisation, Point, solve_slp
 from chargetune.model.parameter_space import Parameter, ParameterSpace

@@ -1,6 +1,7 @@
 """The search on a simulated plant, with a limit of two windows, against its closed form."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +9,14 @@ import pytest
 from two_pairs import AnotherCell
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.controller import controller_of, measured_rows
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.tunables import ResistanceRatio
+from chargetune.battery.charging.verdict import limit_samples, score_episode
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.search import ROUNDING, Search
 from chargetune.model.parameter_space import Parameter, ParameterSpace
+from charging_problems import charging_problem
 
 SPACE = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5, size=2),))
 START = np.array([0.1, 0.8])
@@ -87,15 +92,17 @@ def test_a_charge_that_rides_its_limit_is_searched_at_every_sample():
     """Nine R0 nodes, a cell that rests 0.7 mV over the limit, 0.4 mV allowed: 38.5 min is what 6000 evaluations of CMA-ES reach."""
     cell, simulated = default_cell(), []
     other = AnotherCell(replace(cell, ocv_V=tuple(v + 7e-4 for v in cell.ocv_V)))
-    parts = (ResistanceRatio("R0", 0.1, 4.0),)
-    problem = ChargingProblem(cell, mismatch_seed=41, tolerance_V=1e-3, charge_time_to_soc=0.95, ratios=parts, plant_model=other)
+    problem = charging_problem(cell, mismatch_seed=41, tolerance_V=1e-3, charge_time_to_soc=0.95, R0=ResistanceRatio(0.1, 4.0), plant=other)
     loop = SimpleNamespace(
-        controller=problem.controller, measured_rows=lambda e: problem.measured_rows(e) - 2e-4, score=problem.score, samples=problem.samples
+        controller=controller_of(problem),
+        measured_rows=lambda e: measured_rows(problem, e) - 2e-4,
+        score=partial(score_episode, problem),
+        samples=partial(limit_samples, problem),
     )
 
     def simulate(thetas):
         simulated.extend(thetas)
-        return [problem.episode(theta) for theta in thetas]
+        return [run_charge(problem, theta) for theta in thetas]
 
     found = Search(loop, simulate, problem.space, share=0.4)
     found.envelope(np.ones(9), 6)

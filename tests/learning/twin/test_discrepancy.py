@@ -11,22 +11,23 @@ from two_pairs import AnotherCell, TwoPairs
 
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.learning.black_box.gaussian_process import SurrogateWarning
 from chargetune.learning.twin.calibration import SCALES, calibrate_scale
 from chargetune.learning.twin.discrepancy import LENGTH, Discrepancy, _fit, _Part
 from chargetune.learning.twin.ensemble import condition
-from chargetune.plants.sensors import Sensors
+from charging_problems import changed, charging_problem
 
 CELL = default_cell()
 WARM = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1))
 
 
 def charge(seed=1, *, pairs=False, cell=CELL, **changes):
-    return ChargingProblem(
-        cell, mismatch_seed=seed, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}),
-        plant_model=TwoPairs(cell) if pairs else None, **changes,
+    return charging_problem(
+        cell, mismatch_seed=seed, R0=ResistanceRatio(0.1, 4.0), voltage_noise_sd_V=0.002,
+        plant=TwoPairs(cell) if pairs else None, **changes,
     )  # fmt: skip
 
 
@@ -35,7 +36,7 @@ def told(episode):
 
 
 def beliefs(problem, ratios):
-    episodes = [problem.episode(np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
+    episodes = [run_charge(problem, np.full(9, ratio), seed) for seed, ratio in enumerate(ratios)]
     return condition(ChargingTwin(problem), [told(e) for e in episodes]), episodes
 
 
@@ -61,7 +62,7 @@ def test_intervals_cover_the_next_trial(pairs):
     for seed in range(4):
         problem = charge(seed, pairs=pairs)
         ensemble, _ = beliefs(problem, (4.0, 2.0))
-        following = problem.episode(np.full(9, 1.6), 10)
+        following = run_charge(problem, np.full(9, 1.6), 10)
         voltages = drawn_voltages(ensemble, following)
         spread = np.sqrt(voltages.var(axis=0) + 0.002**2)
         measured = np.stack(following.signal("voltage_V"), axis=1)
@@ -79,7 +80,7 @@ def test_what_was_measured_is_reproduced_by_every_drawn_plant():
 def test_a_sample_is_surer_where_something_was_measured():
     ensemble, episodes = beliefs(charge(pairs=True), (4.0,))
     near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(ensemble, charge(pairs=True).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    far = drawn_voltages(ensemble, run_charge(charge(pairs=True), np.full(9, 1.6), 5)).std(axis=0).mean()
     assert far > 3 * near
 
 
@@ -87,7 +88,7 @@ def test_between_the_nodes_of_a_coarse_table_a_sample_is_as_sure():
     """With three features the nodes are far from what was measured, and every sampled plant has to pass through it all the same."""
     ensemble, episodes = beliefs(charge(pairs=True, cell=WARM), (4.0,))
     near = drawn_voltages(ensemble, episodes[0]).std(axis=0).mean()
-    far = drawn_voltages(ensemble, charge(pairs=True, cell=WARM).episode(np.full(9, 1.6), 5)).std(axis=0).mean()
+    far = drawn_voltages(ensemble, run_charge(charge(pairs=True, cell=WARM), np.full(9, 1.6), 5)).std(axis=0).mean()
     assert len(ensemble.loop.features) == 3
     assert far > 20 * near
 
@@ -109,7 +110,7 @@ def test_a_temperature_at_its_limit_is_foretold():
     """The cell heats faster and cools better than its model, and its temperature was held at the limit once."""
     other = replace(CELL, thermal=Thermal(heat_capacity_J_K=38.0, cooling_W_K=0.13))
     problem = charge(pairs=False, cell=WARM, temperature_max_K=302.0, steps=240)
-    problem = replace(problem, plant_model=AnotherCell(other))
+    problem = changed(problem, plant=AnotherCell(other))
     ensemble, episodes = beliefs(problem, (1.0,))
     highest = np.max(episodes[0].signal("temperature_K")[1])
     assert abs(highest - 302.0) < 0.1
@@ -121,7 +122,7 @@ def test_a_temperature_at_its_limit_is_foretold():
 def test_a_gap_in_a_feature_is_bridged(name, seen):
     """A sensor that fails for a third of a trial, or for all of it where the twin predicts what it measures."""
     problem = charge(cell=WARM)
-    episode = problem.episode(np.full(9, 4.0), 0)
+    episode = run_charge(problem, np.full(9, 4.0), 0)
     holed = gap(episode, name, slice(100, 200) if seen else slice(None))
     whole, bridged = (
         Discrepancy(condition(ChargingTwin(problem), [told(e)]).posterior, (e,), ChargingTwin(problem).features) for e in (episode, holed)
@@ -133,7 +134,7 @@ def test_a_gap_in_a_feature_is_bridged(name, seen):
 
 def test_a_feature_that_was_never_measured_is_named():
     problem = charge(cell=WARM)
-    holed = gap(problem.episode(np.full(9, 4.0), 0), "soc", slice(None))
+    holed = gap(run_charge(problem, np.full(9, 4.0), 0), "soc", slice(None))
     with pytest.raises(ValueError, match="soc was never measured in an episode of"):
         condition(ChargingTwin(problem), [told(holed)] * 2)
 
@@ -143,7 +144,7 @@ def test_the_scale_grows_with_what_was_not_foretold():
     for pairs in (False, True):
         problem = charge(pairs=pairs)
         before, _ = beliefs(problem, (4.0,))
-        scales.append(calibrate_scale([before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))]))
+        scales.append(calibrate_scale([before.discrepancy.predicted_before(run_charge(problem, np.full(9, 1.6), 7))]))
     assert scales[0] < 2.0 < scales[1]
 
 
@@ -151,7 +152,7 @@ def test_a_repeat_says_nothing_of_elsewhere():
     """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
     problem = charge(pairs=True)
     before, _ = beliefs(problem, (4.0, 1.6))
-    predicted_before = before.discrepancy.predicted_before(problem.episode(np.full(9, 1.6), 7))
+    predicted_before = before.discrepancy.predicted_before(run_charge(problem, np.full(9, 1.6), 7))
     assert predicted_before.standardised_error < 1.0
     for sure in (0.5, 0.84):
         # ln s ~ N(0, 1) as before: its quantile, on a grid of 8 %.
@@ -162,7 +163,7 @@ def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
     """The second trial says that the errors are larger than stated; four repeats of it change that little."""
     problem = charge(pairs=True)
     ratios = (4.0, 1.6, 1.6, 1.6, 1.6, 1.6)
-    trials = [told(problem.episode(np.full(9, ratio), seed)) for seed, ratio in enumerate(ratios)]
+    trials = [told(run_charge(problem, np.full(9, ratio), seed)) for seed, ratio in enumerate(ratios)]
     loop = ChargingTwin(problem)
     scales = [condition(loop, trials[:n]).discrepancy.scale for n in (2, 6)]
     assert scales[0] > 2.0
@@ -179,7 +180,7 @@ def test_a_factor_of_a_covariance_that_rounding_left_indefinite():
 @pytest.mark.usefixtures("virtual_machine")
 def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
     problem = charge(steps=60)
-    trials = [told(problem.episode(np.full(9, ratio), seed)) for seed, ratio in enumerate((4.0, 2.0, 1.6))]
+    trials = [told(run_charge(problem, np.full(9, ratio), seed)) for seed, ratio in enumerate((4.0, 2.0, 1.6))]
     loop = ChargingTwin(problem)
     fits = []
     for n in (2, 3, 3):
@@ -197,7 +198,7 @@ def test_what_was_foretold_once_is_remembered_and_the_same_for_a_new_loop():
 @pytest.mark.usefixtures("virtual_machine")
 def test_before_a_trial_was_foretold_errors_may_be_as_large_as_the_prior_of_the_scale_says():
     problem = charge(steps=60)
-    trials = [told(problem.episode(np.full(9, 4.0), 1))]
+    trials = [told(run_charge(problem, np.full(9, 4.0), 1))]
     scales = [condition(ChargingTwin(problem), trials, sure).discrepancy.scale for sure in (0.5, 0.84)]
     # The quantiles of exp(N(0, 1)) on a grid of 8 %.
     np.testing.assert_allclose(scales, [1.0, np.exp(norm.ppf(0.84))], rtol=0.08)
@@ -216,7 +217,7 @@ def test_the_scale_is_inferred_of_what_it_is_applied_to(scale):
     """The variance that a scale is judged by is that of drawn errors with this scale: Monte Carlo, and through the table."""
     problem = charge(pairs=True, steps=90)
     ensemble, _ = beliefs(problem, (4.0,))
-    episode = problem.episode(np.full(9, 1.6), 5)
+    episode = run_charge(problem, np.full(9, 1.6), 5)
     k = int(np.argmin(np.abs(SCALES - scale)))
     scaled = ensemble.discrepancy.scaled(1.0).scaled(SCALES[k])
     judged = ensemble.discrepancy.scaled(1.0)._off(episode).unmodelled[k, :, 0]

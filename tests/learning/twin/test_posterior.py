@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import root
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.plants.sensors import Sensors
+from charging_problems import charging_problem
 
 # In standard deviations of the posterior, what of the equation may be left, squared; and what a solution further on may differ by.
 LEFT, AWAY = 0.05, 0.3
@@ -15,10 +16,8 @@ LEFT, AWAY = 0.05, 0.3
 
 @pytest.fixture(scope="module")
 def posterior():
-    problem = ChargingProblem(
-        default_cell(), mismatch_seed=1, sensors=Sensors(noise_sd={"voltage_V": 0.002}), steps=120, ratios=(ResistanceRatio("R0"),)
-    )
-    return ChargingTwin(problem).twin.fit([problem.episode(problem.space.default, seed=k) for k in (0, 1)])
+    problem = charging_problem(default_cell(), mismatch_seed=1, voltage_noise_sd_V=0.002, steps=120, R0=ResistanceRatio())
+    return ChargingTwin(problem).twin.fit([run_charge(problem, problem.space.default, seed=k) for k in (0, 1)])
 
 
 def equation(posterior, draw):

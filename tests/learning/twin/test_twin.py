@@ -10,9 +10,11 @@ from two_pairs import AnotherCell, TwoPairs
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.charging.settings import SensorSettings
+from chargetune.battery.charging.tunables import Backoff, ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning import Safety, Twin, TwinTuner, Uncertain
 from chargetune.learning.candidates import Proposal
@@ -20,14 +22,14 @@ from chargetune.learning.twin import twin as twin_module
 from chargetune.learning.twin.ensemble import condition
 from chargetune.learning.twin.laplace import NegativeLogPosterior
 from chargetune.learning.twin_tuner import cautious
-from chargetune.plants.sensors import Sensors
+from charging_problems import changed, charging_problem
 
 CELL = default_cell()
 TABLES = ("R0_ohm", "R1_ohm", "C1_F")
 
 
 def charge(noise=0.002, seed=1, **changes):
-    return ChargingProblem(CELL, mismatch_seed=seed, sensors=Sensors(noise_sd={"voltage_V": noise}), steps=120, **changes)
+    return charging_problem(CELL, mismatch_seed=seed, voltage_noise_sd_V=noise, steps=120, **changes)
 
 
 def twin_of(problem, **changes):
@@ -67,9 +69,9 @@ def test_several_episodes_and_several_unknowns_at_once_are_as_one_after_the_othe
 @pytest.mark.parametrize("changes", [{}, {"plant_model": AnotherCell(CELL)}], ids=["the circuit", "another plant"])
 def test_a_fit_along_the_way_of_another_ends_where_it_would_by_itself(changes, monkeypatch):
     """Within a small part of a standard deviation, and it is as wide; each search begins where the one before ended."""
-    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),), **changes)
+    problem = charge(R0=ResistanceRatio(0.1, 4.0), **changes)
     twin = twin_of(problem)
-    episodes = [problem.episode(np.full(9, ratio), k) for k, ratio in enumerate((2.5, 2.0, 1.7, 1.5))]
+    episodes = [run_charge(problem, np.full(9, ratio), k) for k, ratio in enumerate((2.5, 2.0, 1.7, 1.5))]
     alone, way = twin.fit(episodes), twin.fit(episodes[:3]).way
     begun, search = [], twin_module.least_squares
     monkeypatch.setattr(twin_module, "least_squares", lambda f, e, **how: (begun.append(e), search(f, e, **how))[1])
@@ -82,9 +84,9 @@ def test_a_fit_along_the_way_of_another_ends_where_it_would_by_itself(changes, m
 
 
 def test_plants_whose_drawing_was_begun_are_those_that_are_drawn_when_they_are_needed():
-    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
-    episode = problem.episode(np.full(9, 2.5))
-    trials = [SimpleNamespace(number=0, theta=(2.5,) * 9, status="done", score=problem.score(episode), episode=lambda: episode)]
+    problem = charge(R0=ResistanceRatio(0.1, 4.0))
+    episode = run_charge(problem, np.full(9, 2.5))
+    trials = [SimpleNamespace(number=0, theta=(2.5,) * 9, status="done", score=score_episode(problem, episode), episode=lambda: episode)]
     loop = ChargingTwin(problem)
     begun, needed = condition(loop, trials), condition(loop, trials)
     begun.draw(6, 1)
@@ -109,8 +111,8 @@ def test_without_data_it_is_the_prior():
 def test_covariance_is_that_of_dense_algebra():
     problem = charge()
     twin = twin_of(problem)
-    posterior = twin.fit([problem.episode()], discrepancy=False)
-    inputs = problem.episode().input
+    posterior = twin.fit([run_charge(problem)], discrepancy=False)
+    inputs = run_charge(problem).input
     columns = [
         (twin.predict(posterior.mode + h, inputs) - twin.predict(posterior.mode - h, inputs)).ravel() / 2e-5 for h in 1e-5 * np.eye(27)
     ]
@@ -124,8 +126,8 @@ def test_one_charge_tells_the_voltage_of_another():
     covered = []
     for seed in range(8):
         problem = charge(seed=seed)
-        posterior = twin_of(problem).fit([problem.episode(seed=seed)])
-        other = replace(problem, current_max_A=5.0).episode(seed=100 + seed)
+        posterior = twin_of(problem).fit([run_charge(problem, seed=seed)])
+        other = run_charge(changed(problem, current_max_A=5.0), seed=100 + seed)
         predicted = posterior.twin.predict(posterior.mode, other.input)[..., 0]
         measured = np.stack(other.signal("voltage_V"), axis=1)
         covered.append(np.abs(measured - predicted) < 1.645 * posterior.predicted_sd(other.input)[..., 0])
@@ -133,8 +135,8 @@ def test_one_charge_tells_the_voltage_of_another():
 
 
 def test_draws_do_not_depend_on_how_many_cores_there_are(monkeypatch):
-    problem = charge(ratios=(ResistanceRatio("R0"),))
-    posterior = ChargingTwin(problem).twin.fit([problem.episode(problem.space.default)])
+    problem = charge(R0=ResistanceRatio())
+    posterior = ChargingTwin(problem).twin.fit([run_charge(problem, problem.space.default)])
     drawn = posterior.draw(6, 3)
     monkeypatch.setattr("chargetune.runtime.threads.usable_cores", lambda: 1)
     np.testing.assert_array_equal(posterior.draw(6, 3), drawn)
@@ -143,14 +145,14 @@ def test_draws_do_not_depend_on_how_many_cores_there_are(monkeypatch):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("factor", [30.0, 100.0, 1e3, 1e4])
 def test_a_draw_from_which_outputs_are_not_finite_is_halved(factor):
-    problem = charge(ratios=(ResistanceRatio("R0"),))
-    posterior = ChargingTwin(problem).twin.fit([problem.episode(problem.space.default)])
+    problem = charge(R0=ResistanceRatio())
+    posterior = ChargingTwin(problem).twin.fit([run_charge(problem, problem.space.default)])
     assert np.all(np.isfinite(replace(posterior, root=factor * posterior.root).draw(8, 0)))
 
 
 def test_missing_samples_and_short_traces_are_taken_as_they_are():
     problem = charge()
-    episode = problem.episode()
+    episode = run_charge(problem)
     holes = episode.output_end.copy()
     holes[::3, 0] = np.nan
     short = replace(episode, output_end=holes).cut(60, episode.ending, "")
@@ -162,7 +164,7 @@ def test_missing_samples_and_short_traces_are_taken_as_they_are():
 @pytest.mark.usefixtures("virtual_machine")
 def test_where_the_record_of_the_input_ends_nothing_is_predicted_and_nothing_is_lost():
     problem = charge()
-    episode = problem.episode(problem.space.default, 0)
+    episode = run_charge(problem, problem.space.default, 0)
     lost = replace(episode, input=episode.input.copy(), output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
     for values in (lost.input, lost.output_start, lost.output_end):
         values[90:] = np.nan
@@ -188,7 +190,7 @@ def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
 def test_the_controller_reads_what_the_twin_cannot_represent():
     """A cell that is half a kelvin warmer than its model, held at a limit of temperature, against a sensor that is off by as much."""
     warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.05, activation_J_mol=15e3))
-    problem = ChargingProblem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, ratios=(ResistanceRatio("R0"),))
+    problem = charging_problem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, R0=ResistanceRatio())
     loop = ChargingTwin(problem)
 
     lookup_table = LookupTable.over(loop.features, list(loop.twin.noise_sd))
@@ -196,8 +198,8 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
     theta = problem.space.default
     predicted = loop.simulate([(theta, np.zeros(27), warmer)])[0]
     # The circuit of the twin is the controller's own: the plant without a mismatch.
-    biased = replace(problem, plant_model=AnotherCell(problem.controller_cell), sensors=Sensors(bias={"temperature_K": 0.5}))
-    measured = biased.episode(theta)
+    biased = changed(problem, plant=AnotherCell(problem.controller_cell), temperature_bias_K=0.5)
+    measured = run_charge(biased, theta)
     for name in ("temperature_K", "voltage_V"):
         np.testing.assert_allclose(predicted.signal(name)[1], measured.signal(name)[1], rtol=0, atol=1e-6)
     assert np.max(measured.signal("temperature_K")[1]) == pytest.approx(305.0, abs=0.1)
@@ -207,7 +209,7 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
 
 def test_what_the_model_cannot_represent_is_a_discrepancy():
     problem = charge(noise=0.0005)
-    episode = problem.episode()
+    episode = run_charge(problem)
     wrong = episode.output_end.copy()
     wrong[:, 0] += 0.01 * np.sin(np.arange(len(episode)) / 3)
     posterior = twin_of(problem).fit([replace(episode, output_end=wrong)])
@@ -236,17 +238,15 @@ def test_nonsense_is_refused_by_name(make, said):
 
 def test_three_trials_are_enough():
     """Nine R0 nodes, resistances wrong by up to half, 2 mV noise: the plant's true excess and t95 beside the attainable ones."""
-    noisy = ChargingProblem(
-        CELL, mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0),), sensors=Sensors(noise_sd={"voltage_V": 0.002}), verdict_samples=5
-    )
-    exact = replace(noisy, sensors=Sensors())
+    noisy = charging_problem(CELL, mismatch_seed=1, R0=ResistanceRatio(0.1, 4.0), voltage_noise_sd_V=0.002, verdict_samples=5)
+    exact = changed(noisy, sensors=SensorSettings())
     tuner, trials = TwinTuner(ChargingTwin(noisy)), []
     for number in range(3):
         theta = tuner.ask(noisy.space, trials)[0]
-        score, episode, _ = noisy(theta, number)
+        score, episode, _ = evaluate(noisy, theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
     np.testing.assert_array_equal(trials[0].theta, noisy.space.default)
-    metrics = exact.score(exact.episode(trials[-1].theta)).metrics
+    metrics = score_episode(exact, run_charge(exact, trials[-1].theta)).metrics
     assert metrics["overshoot_mV"] <= 1.0
     # 36.7 min is what 4000 evaluations of CMA-ES reach on this plant.
     assert metrics["t95_min"] <= 1.05 * 36.7
@@ -257,25 +257,23 @@ def test_three_trials_are_enough():
 def test_no_envelope_step_leads_away_from_the_best_objective():
     """Here a step that takes some sd back moves backoff from 100 to 90 % SOC, and costs minutes; polished it stays there (39.8)."""
     backoff = Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)
-    noisy = ChargingProblem(
-        CELL, mismatch_seed=16, backoff=backoff, sensors=Sensors(noise_sd={"voltage_V": 0.002}), verdict_samples=5, charge_time_to_soc=0.95
-    )
+    noisy = charging_problem(CELL, mismatch_seed=16, backoff=backoff, voltage_noise_sd_V=0.002, verdict_samples=5, charge_time_to_soc=0.95)
     second, trials = [0.03, 0.03, 0.06, 0.135, 0.09, 0.03, 0.027, -0.096, -0.044, 0.05, 0.023], []
     for number, theta in enumerate((noisy.space.default, np.array(second))):
-        score, episode, _ = noisy(theta, number)
+        score, episode, _ = evaluate(noisy, theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
-    exact = replace(noisy, sensors=Sensors())
-    metrics = exact.score(exact.episode(TwinTuner(ChargingTwin(noisy)).ask(noisy.space, trials)[0])).metrics
+    exact = changed(noisy, sensors=SensorSettings())
+    metrics = score_episode(exact, run_charge(exact, TwinTuner(ChargingTwin(noisy)).ask(noisy.space, trials)[0])).metrics
     assert metrics["overshoot_mV"] <= 1.0
     # 37.1 min is what the third and fourth trials of a study reach with 0.6 mV over.
     assert metrics["t95_min"] <= 1.03 * 37.1
 
 
 def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
-    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    problem = charge(R0=ResistanceRatio(0.1, 4.0))
     theta, trials = problem.space.default, []
     for number in range(2):
-        score, episode, _ = problem(theta * (1.0 + number), number)
+        score, episode, _ = evaluate(problem, theta * (1.0 + number), number)
         trials.append(
             SimpleNamespace(number=number, theta=tuple(theta * (1.0 + number)), status="done", score=score, episode=lambda e=episode: e)
         )
@@ -289,10 +287,10 @@ def test_what_is_taken_back_makes_it_likelier_that_the_limits_are_kept():
 
 def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first():
     """The plant overshoots by 60 mV, and an R1 within 1 % cannot change that."""
-    problem = charge(ratios=(ResistanceRatio("R1", 0.99, 1.01),))
+    problem = charge(R1=ResistanceRatio(0.99, 1.01))
     theta, trials = problem.space.default, []
     for number in range(2):
-        score, episode, _ = problem(theta, number)
+        score, episode, _ = evaluate(problem, theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
     tuner = TwinTuner(ChargingTwin(problem))
     found = cautious(Proposal(tuner.loop, problem.space, condition(tuner.loop, trials), trials, 3), theta)
@@ -303,7 +301,7 @@ def test_where_nothing_can_be_taken_back_it_is_not_and_the_likeliest_comes_first
 
 
 def test_without_a_trace_the_design_is_theta_0_and_sobol():
-    problem = charge(ratios=(ResistanceRatio("R0"),))
+    problem = charge(R0=ResistanceRatio())
     tuner = TwinTuner(ChargingTwin(problem))
     first = tuner.ask(problem.space, [], 3)
     np.testing.assert_array_equal(first[0], problem.space.default)
@@ -312,9 +310,9 @@ def test_without_a_trace_the_design_is_theta_0_and_sobol():
 
 
 def test_beside_a_running_trial_another_theta_is_proposed():
-    problem = charge(ratios=(ResistanceRatio("R0"),))
+    problem = charge(R0=ResistanceRatio())
     tuner = TwinTuner(ChargingTwin(problem), pool=8, steps=2, iterations=3)
-    score, episode, _ = problem(problem.space.default, 0)
+    score, episode, _ = evaluate(problem, problem.space.default, 0)
     trials = [SimpleNamespace(number=0, theta=tuple(problem.space.default), status="done", score=score, episode=lambda: episode)]
     expected = tuner.ask(problem.space, trials)[0]
     for number in (1, 2):
@@ -328,7 +326,7 @@ def test_beside_a_running_trial_another_theta_is_proposed():
 
 
 def test_a_safe_twin_takes_nothing_from_a_running_trial():
-    problem = charge(ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    problem = charge(R0=ResistanceRatio(0.1, 4.0))
     tuner = TwinTuner(ChargingTwin(problem), safety=Safety())
     first = tuner.ask(problem.space, [])
     running = [SimpleNamespace(number=0, theta=tuple(first[0]), status="running", score=None, episode=None)]
@@ -337,8 +335,8 @@ def test_a_safe_twin_takes_nothing_from_a_running_trial():
 
 def test_a_posterior_is_that_of_the_spread_that_it_states():
     """Mode, curvature and sections by the misfit with ``Posterior.spread``, on a plant that the twin cannot be."""
-    problem = charge(plant_model=TwoPairs(CELL), ratios=(ResistanceRatio("R0", 0.1, 4.0),))
-    episodes = [problem.episode(np.full(9, level), k) for k, level in enumerate((4.0, 2.0))]
+    problem = charge(plant=TwoPairs(CELL), R0=ResistanceRatio(0.1, 4.0))
+    episodes = [run_charge(problem, np.full(9, level), k) for k, level in enumerate((4.0, 2.0))]
     twin = twin_of(problem)
     posterior = twin.fit(episodes)
     misfit = NegativeLogPosterior(twin, [(e.input, twin.measured(e)) for e in episodes], posterior.spread)
@@ -349,7 +347,7 @@ def test_a_posterior_is_that_of_the_spread_that_it_states():
 
 def test_only_what_was_not_measured_has_no_verdict():
     problem = charge()
-    loop, episode = ChargingTwin(problem), problem.episode(problem.space.default, 0)
+    loop, episode = ChargingTwin(problem), run_charge(problem, problem.space.default, 0)
     holed = replace(episode, output_end=np.full_like(episode.output_end, np.nan))
     assert loop.score(holed) is None
     with pytest.raises(ValueError, match="unknown output"):
