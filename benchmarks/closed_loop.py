@@ -2,7 +2,7 @@
 
 P0 is the case study's hour of charging (360 steps, horizon 5, U1 measured) with the perfect model and five wrong ones.
 Everything is measured in one run, in rounds that alternate between the tools; figures are medians. An episode counts with
-all of its Python (`ChargingProblem.episode`). Set-up counts building and compiling, not the start of Python.
+all of its Python (`run_charge`). Set-up counts building and compiling, not the start of Python.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -22,7 +22,11 @@ import numpy as np
 from peers import do_mpc_loop, ipopt_loop
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of, run_charge
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import ControllerSettings, EpisodeSettings
+from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.episode.compiled import compiled_episode
 
 SEEDS = (None, 0, 1, 2, 3, 4)
@@ -30,16 +34,20 @@ HORIZONS = (5, 10, 20, 40)
 FRESH = """
 import time
 from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import ControllerSettings
 begin = time.perf_counter()
-ChargingProblem(default_cell(), mismatch_seed=0, overpotential="exact").episode()
+run_charge(ChargingProblem(default_cell(), controller=ControllerSettings(mismatch_seed=0, overpotential="exact")))
 print(time.perf_counter() - begin)
 """
 
 
-def problem(seed, **changes):
+def problem(seed, overpotential="exact", horizon=5, **tables):
     """P0 for one wrong model."""
-    return ChargingProblem(default_cell(), mismatch_seed=seed, overpotential="exact", **changes)
+    return ChargingProblem(
+        default_cell(), controller=ControllerSettings(horizon=horizon, mismatch_seed=seed, overpotential=overpotential), **tables
+    )
 
 
 def seconds(run, repeats):
@@ -67,23 +75,19 @@ def set_up():
 
 def failures():
     """Control steps that missed the program's own optimality test, over 20 wrong models and both ways to know U1."""
-    return sum(
-        ChargingProblem(default_cell(), mismatch_seed=seed, overpotential=treatment).episode().failures
-        for seed in range(20)
-        for treatment in ("exact", "model")
-    )
+    return sum(run_charge(problem(seed, treatment)).failures for seed in range(20) for treatment in ("exact", "model"))
 
 
 def run_chunk(own, thetas):
     """SOC at the end for each theta; runs in a worker."""
-    return [float(own.episode(theta).signal("soc")[1][-1]) for theta in thetas]
+    return [float(run_charge(own, theta).signal("soc")[1][-1]) for theta in thetas]
 
 
 def batch():
     """Seconds for 1000 episodes of different theta on two new worker processes."""
-    own = problem(0, backoff=Backoff(7))
+    own = problem(0, theta=Tunables(backoff=Backoff(7)))
     thetas = np.random.default_rng(0).uniform(0.0, 0.1, (1000, 7))
-    own.episode()
+    run_charge(own)
     begin = time.perf_counter()
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         done = [soc for part in pool.map(run_chunk, [own] * 8, np.array_split(thetas, 8)) for soc in part]
@@ -105,7 +109,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=3, help="rounds of the comparison with the peers")
     arguments = parser.parse_args()
     problems = [problem(seed) for seed in SEEDS]
-    virtual = [compiled_episode(p.controller, p.plant, p.steps, compiled=False) for p in problems]
+    virtual = [compiled_episode(controller_of(p), plant_of(p), p.episode.steps, compiled=False) for p in problems]
 
     times = {"compiled": [], "vm": [], "do_mpc": [], "casadi_ipopt": []}
     ratios = {"do_mpc": [], "do_mpc_vm": [], "casadi_ipopt": []}
@@ -114,16 +118,16 @@ def main():
     for k in range(arguments.rounds):
         own, machine = problems[k % len(problems)], virtual[k % len(problems)]
         name = "oracle" if SEEDS[k % len(SEEDS)] is None else f"seed{SEEDS[k % len(SEEDS)]}"
-        compiled = [seconds(own.episode, 50)]
+        compiled = [seconds(partial(run_charge, own), 50)]
         vm = [seconds(machine.run, 10)]
         peers = {}
         for peer, loop in (("do_mpc", do_mpc_loop), ("casadi_ipopt", ipopt_loop)):
-            currents, peers[peer] = loop(own, own.steps)
+            currents, peers[peer] = loop(own, own.episode.steps)
             times[peer].append(peers[peer])
             if name in reference:
                 deviation[peer] = max(deviation[peer], float(np.max(np.abs(currents - reference[name]))))
         # Before and after the peers, since the machine's speed drifts.
-        compiled.append(seconds(own.episode, 50))
+        compiled.append(seconds(partial(run_charge, own), 50))
         vm.append(seconds(machine.run, 10))
         times["compiled"] += compiled
         times["vm"] += vm
@@ -133,9 +137,9 @@ def main():
     for seed, own in zip(SEEDS, problems, strict=True):
         name = "oracle" if seed is None else f"seed{seed}"
         if name in reference:
-            deviation["chargetune"] = max(deviation["chargetune"], float(np.max(np.abs(own.episode().input[:, 0] - reference[name]))))
+            deviation["chargetune"] = max(deviation["chargetune"], float(np.max(np.abs(run_charge(own).input[:, 0] - reference[name]))))
 
-    horizons = {str(n): 1e3 * statistics.median(seconds(problem(s, horizon=n).episode, 20) for s in SEEDS) for n in HORIZONS}
+    horizons = {str(n): 1e3 * statistics.median(seconds(partial(run_charge, problem(s, horizon=n)), 20) for s in SEEDS) for n in HORIZONS}
     cold, cached = set_up()
     result = {
         "episode_ms": {"compiled": horizons, "vm": {"5": 1e3 * statistics.median(times["vm"])}},
@@ -148,7 +152,7 @@ def main():
     if arguments.json:
         print(json.dumps(result))
         return
-    steps = {n: 1e3 * seconds(replace(problems[1], steps=n).episode, 30) for n in (90, 180, 360, 720)}
+    steps = {n: 1e3 * seconds(partial(run_charge, problem(SEEDS[1], episode=EpisodeSettings(steps=n))), 30) for n in (90, 180, 360, 720)}
     print("ms an episode, compiled: " + ", ".join(f"N = {n}: {ms:.2f}" for n, ms in horizons.items()))
     print(
         f"  N = 20 / N = 5: {horizons['20'] / horizons['5']:.2f}; over the steps: " + ", ".join(f"{n}: {ms:.2f}" for n, ms in steps.items())

@@ -21,6 +21,7 @@ from learning_plants import PLANTS, STUDIES, make_problem
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from chargetune.battery.charging.evaluate import evaluate
 from chargetune.episode.episode import Episode
 from chargetune.learning.twin.ensemble import Ensemble, condition
 from chargetune.learning.twin.settings import TwinSettings
@@ -50,10 +51,10 @@ def study(plant: str, name: str, seed: int) -> list[list[float]]:
     with threadpool_limits(1):
         for k in range(TRIALS + 1):
             theta = tuner.ask(problem.space, told, 1)[0]
-            score, episode, ending = problem(theta, 1000 * seed + k)
+            score, episode, ending = evaluate(problem, theta, 1000 * seed + k)
             if told:
                 ensemble = condition(tuner.loop, told, TwinSettings(plants=PLANTS_DRAWN))
-                other = problem(afar, 1000 * seed + 500 + k)[1]
+                other = evaluate(problem, afar, 1000 * seed + 500 + k)[1]
                 out.append([share(ensemble, e, seed) for e in (episode, other)])
             status = "done" if score else "failed"
             told.append(

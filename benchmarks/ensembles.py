@@ -15,7 +15,11 @@ from itertools import product
 import numpy as np
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import ControllerSettings
+from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.episode.compiled import compiled_episode
 from chargetune.runtime.threads import usable_cores
 
@@ -28,10 +32,10 @@ def main():
     parser.add_argument("--json", action="store_true", help="print JSON for a program")
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
-    problem = ChargingProblem(default_cell(), mismatch_seed=0, backoff=Backoff(7))
-    loop = compiled_episode(problem.controller, problem.plant, problem.steps)
+    problem = ChargingProblem(default_cell(), controller=ControllerSettings(mismatch_seed=0), theta=Tunables(backoff=Backoff(7)))
+    loop = compiled_episode(controller_of(problem), plant_of(problem), problem.episode.steps)
     random = np.random.default_rng(0)
-    nominal = np.array(problem.plant_cell.R0_ohm)
+    nominal = np.array(problem.cell.R0_ohm)
     model = loop.plant.model
     plants = [replace(loop.plant, model=model.with_parameters(R0_ohm=tuple(nominal * f))) for f in random.uniform(0.6, 1.5, PLANTS)]
     thetas = random.uniform(0.0, 0.1, (THETAS, 7))

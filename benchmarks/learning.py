@@ -36,8 +36,10 @@ from rich.progress import track
 from rich.table import Column, Table
 
 from chargetune import learning
+from chargetune.battery.charging.evaluate import evaluate, run_charge
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.charging.verdict import charge_samples, score_episode
 from chargetune.learning.closed_loop.search import Search
 from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.twin.settings import TwinSettings
@@ -58,7 +60,7 @@ def _safe(problem: Any, seed: int) -> Any:
 
 
 def _twin(problem: Any) -> ChargingTwin:
-    unknown = isinstance(problem.plant_model, UnknownCell)
+    unknown = isinstance(problem.plant, UnknownCell)
     return ChargingTwin(problem, capacity_spread=0.03, soc_spread=0.012, ocv_spread_V=0.003) if unknown else ChargingTwin(problem)
 
 
@@ -86,20 +88,22 @@ def attainable_t95(plant: str, study: str, seed: int) -> float:
 
 
 def _attainable_t95(plant: str, study: str, seed: int, bound_V: float) -> float:
-    problem = replace(exact(make_problem(plant, study, seed, 0.0)), soc_windows=24, tolerance_V=bound_V)
+    problem = exact(make_problem(plant, study, seed, 0.0))
+    objective, limits = replace(problem.objective, soc_windows=24), replace(problem.limits, tolerance_V=bound_V)
+    problem = replace(problem, objective=objective, limits=limits)
     best, mark = [float("inf")], _mark(plant)
 
     class Truth:
         def samples(self, episode: Any) -> Any:
-            return problem.samples(episode)
+            return charge_samples(problem, episode)
 
         def score(self, episode: Any) -> Any:
-            score = problem.score(episode)
+            score = score_episode(problem, episode)
             if score.feasible and score.metrics[mark]:
                 best[0] = min(best[0], score.metrics[mark])
             return score
 
-    search = Search(Truth(), lambda thetas: [problem.episode(theta) for theta in thetas], problem.space, share=1.0)
+    search = Search(Truth(), lambda thetas: [run_charge(problem, theta) for theta in thetas], problem.space, share=1.0)
     space = problem.space
     first = [space.to_unit(space.default), np.full(space.dimension, 0.9)]
     if plant in DFN:
@@ -123,7 +127,8 @@ def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int
     problem = make_problem(plant, study, seed, noise_V)
     truth = exact(problem)
     if method not in PROMISING:
-        problem = replace(problem, tolerance_V=SHARE_TOLD * problem.tolerance_V)
+        limits = replace(problem.limits, tolerance_V=SHARE_TOLD * problem.limits.tolerance_V)
+        problem = replace(problem, limits=limits)
     tuner = METHODS[method](problem, seed)
     tuner = tuner if settings is None else replace(tuner, settings=settings)
     told: list[Any] = []
@@ -139,12 +144,12 @@ def run(plant: str, study: str, noise_V: float, trials: int, job: tuple[str, int
                 # It stops here, with what it has.
                 break
         out["ask_s"].append(time.perf_counter() - begin)
-        score, episode, ending = problem(theta, 1000 * seed + number)
+        score, episode, ending = evaluate(problem, theta, 1000 * seed + number)
         status = "done" if score else "failed"
         told.append(
             SimpleNamespace(number=number, theta=tuple(theta), status=status, score=score, ending=ending, episode=lambda e=episode: e)
         )
-        verdict = truth.score(truth.episode(theta))
+        verdict = score_episode(truth, run_charge(truth, theta))
         metrics = verdict.metrics
         out["excess_mV"].append(metrics["overshoot_mV"])
         out["excess_K"].append(metrics.get("temperature_max_excess_K"))

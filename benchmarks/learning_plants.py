@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 
 from chargetune.battery.cell.cell import Cell, default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
+from chargetune.battery.charging.limits import LimitSettings
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio
+from chargetune.battery.charging.settings import ControllerSettings, Objective, SensorSettings
+from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio, Tunables
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.studies.study_file import load_config
 from chargetune.model.model import Model, Signal
@@ -22,10 +23,10 @@ __all__ = ["DFN", "PLANTS", "STUDIES", "StructuralPlant", "UnknownCell", "exact"
 
 # theta of each study: nine nodes of R0, eleven of a signed backoff, and the paper's backoff and R1.
 STUDIES = {
-    "r0": {"ratios": (ResistanceRatio("R0", 0.1, 4.0),)},
-    "signed": {"backoff": Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)},
-    "backoff": {"backoff": Backoff(lower_V=0.0, upper_V=0.2)},
-    "model": {"ratios": (ResistanceRatio("R1"),)},
+    "r0": Tunables(R0=ResistanceRatio(0.1, 4.0)),
+    "signed": Tunables(backoff=Backoff(nodes=11, lower_V=-0.3, upper_V=0.3)),
+    "backoff": Tunables(backoff=Backoff(lower_V=0.0, upper_V=0.2)),
+    "model": Tunables(R1=ResistanceRatio()),
 }
 # PyBaMM's DFN by ambient temperature in K, largest current in A, and whether temperature and anode potential are limited too.
 DFN = {
@@ -94,51 +95,52 @@ def make_problem(plant: str, study: str, seed: int, noise_V: float) -> ChargingP
     """What the learner sees: noisy outputs, its own wrong model. Raises ValueError for an unknown plant or study."""
     if plant not in PLANTS or study not in STUDIES:
         raise ValueError(f"plant = {plant!r}, study = {study!r}; allowed are {', '.join(PLANTS)} and {', '.join(STUDIES)}")
-    sensors = Sensors(noise_sd={"voltage_V": noise_V}) if noise_V else Sensors()
+    sensors = SensorSettings(voltage_noise_sd_V=noise_V)
     if plant in DFN:
         ambient_K, current_max_A, limits = DFN[plant]
         return _dfn(ambient_K, current_max_A, study, sensors, limits=limits)
     cell = default_cell()
     problem = ChargingProblem(
         cell,
-        mismatch_seed=seed,
+        controller=ControllerSettings(mismatch_seed=seed),
+        limits=LimitSettings(tolerance_V=TOLERANCE_V),
         sensors=sensors,
-        tolerance_V=TOLERANCE_V,
-        verdict_samples=5,
-        charge_time_to_soc=0.95,
-        **STUDIES[study],  # type: ignore[arg-type]
+        objective=Objective(charge_time_to_soc=0.95, verdict_samples=5),
+        theta=STUDIES[study],
     )
     if plant == "structural":
-        return replace(problem, plant_model=StructuralPlant(cell))
+        return replace(problem, plant=StructuralPlant(cell))
     if plant == "unknown":
         import numpy as np
 
         draw = np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, 3) * (0.05, 0.02, 0.005)
-        return replace(problem, plant_model=UnknownCell(cell, *(float(v) for v in draw)))
+        return replace(problem, plant=UnknownCell(cell, *(float(v) for v in draw)))
     return problem
 
 
-def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: Sensors, *, limits: bool) -> ChargingProblem:
+def _dfn(ambient_K: float, current_max_A: float, study: str, sensors: SensorSettings, *, limits: bool) -> ChargingProblem:
     """SOC measured, overpotential by the controller's own model; the seed decides the noise and nothing else.
 
     ``limits``: not the voltage's alone but also at most 318.15 K and no lithium plating, both with a backoff in theta.
     """
     problem = load_config(EXAMPLE).problem(EXAMPLE.parent)
-    cell, plant = problem.plant_cell, problem.plant_model
+    cell, plant = problem.cell, problem.plant
     if cell.thermal is None or not isinstance(plant, Electrochemical):
         raise TypeError(f"{EXAMPLE.name} is to describe a cell with a temperature and an electrochemical plant")
-    settings: dict[str, Any] = dict(STUDIES[study])
+    theta, bounds = STUDIES[study], LimitSettings(current_max_A=current_max_A, tolerance_V=TOLERANCE_V)
     if limits:
-        settings |= {
-            "temperature_max_K": 318.15, "tolerance_K": 0.2, "anode_min_V": 0.0, "tolerance_anode_V": 1e-3,
-            "limit_backoffs": (LimitBackoff("temperature", -8.0, 8.0), LimitBackoff("anode", -0.05, 0.05, nodes=6)),
-        }  # fmt: skip
+        theta = replace(theta, temperature_backoff=LimitBackoff(-8.0, 8.0), anode_backoff=LimitBackoff(-0.05, 0.05, nodes=6))
+        bounds = replace(bounds, temperature_max_K=318.15, tolerance_K=0.2, anode_min_V=0.0, tolerance_anode_V=1e-3)
     return ChargingProblem(
-        replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)), mismatch_seed=None, sensors=sensors, tolerance_V=TOLERANCE_V,
-        verdict_samples=5, charge_time_to_soc=0.8, current_max_A=current_max_A, plant_model=replace(plant, ambient_K=ambient_K), **settings,
-    )  # fmt: skip
+        replace(cell, thermal=replace(cell.thermal, ambient_K=ambient_K)),
+        plant=replace(plant, ambient_K=ambient_K),
+        limits=bounds,
+        sensors=sensors,
+        objective=Objective(charge_time_to_soc=0.8, verdict_samples=5),
+        theta=theta,
+    )
 
 
 def exact(problem: ChargingProblem) -> ChargingProblem:
     """The same plant and controller, judged without noise."""
-    return replace(problem, sensors=Sensors(), verdict_samples=1)
+    return replace(problem, sensors=SensorSettings(), objective=replace(problem.objective, verdict_samples=1))

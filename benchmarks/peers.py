@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model
+from chargetune.battery.charging.controller import controller_of
 
 LOWEST_V, LIMIT_V, CURRENT_MAX_A, PENALTY = 2.5, 4.2, 6.0, 1e3
 
@@ -22,7 +23,7 @@ def do_mpc_loop(problem, steps):
         warnings.simplefilter("ignore")
         import do_mpc
 
-    own, plant = problem.controller.model, ecm_model(problem.plant_cell)
+    own, plant = controller_of(problem).model, ecm_model(problem.cell)
     model = do_mpc.model.Model("discrete", "SX")
     z, u1 = model.set_variable("_x", "z"), model.set_variable("_x", "u1")
     current = model.set_variable("_u", "i")
@@ -35,7 +36,9 @@ def do_mpc_loop(problem, steps):
     model.setup()
     mpc = do_mpc.controller.MPC(model)
     quiet = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes"}
-    mpc.set_param(n_horizon=problem.horizon, t_step=problem.sampling_time_s, store_full_solution=False, nlpsol_opts=quiet)
+    mpc.set_param(
+        n_horizon=problem.controller.horizon, t_step=problem.controller.sampling_time_s, store_full_solution=False, nlpsol_opts=quiet
+    )
     mpc.set_objective(lterm=(1 - model.x["z"]) ** 2, mterm=(1 - model.x["z"]) ** 2)
     mpc.set_rterm(i=0.0)
     mpc.bounds["lower", "_u", "i"] = 0.0
@@ -44,7 +47,7 @@ def do_mpc_loop(problem, steps):
         mpc.set_nl_cons(f"{name}_max", model.aux[name], ub=LIMIT_V, soft_constraint=True, penalty_term_cons=PENALTY)
         mpc.set_nl_cons(f"{name}_min", -model.aux[name], ub=-LOWEST_V, soft_constraint=True, penalty_term_cons=PENALTY)
     mpc.setup()
-    x = np.array([[problem.soc_start], [0.0]])
+    x = np.array([[problem.episode.soc_start], [0.0]])
     mpc.x0 = x
     mpc.set_initial_guess()
     return _loop(lambda at: mpc.make_step(at)[0, 0], plant, x, steps)
@@ -52,7 +55,7 @@ def do_mpc_loop(problem, steps):
 
 def ipopt_loop(problem, steps):
     """(currents (A), seconds) of a loop by single shooting on CasADi's nlpsol with IPOPT; set-up not counted."""
-    own, plant, horizon = problem.controller.model, ecm_model(problem.plant_cell), problem.horizon
+    own, plant, horizon = controller_of(problem).model, ecm_model(problem.cell), problem.controller.horizon
     start, inputs, slack = ca.SX.sym("x", 2), ca.SX.sym("u", horizon), ca.SX.sym("s")
     state, cost, rows = start, PENALTY * slack, []
     for i in range(horizon):
@@ -74,7 +77,7 @@ def ipopt_loop(problem, steps):
         guess.update(x0=np.concatenate([plan[1:horizon], plan[horizon - 1 :]]), lam_x0=found["lam_x"], lam_g0=found["lam_g"])
         return plan[0]
 
-    return _loop(act, plant, np.array([problem.soc_start, 0.0]), steps)
+    return _loop(act, plant, np.array([problem.episode.soc_start, 0.0]), steps)
 
 
 def _loop(act, plant, x, steps):

@@ -13,8 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.kalman import Kalman
+from chargetune.battery.charging.limits import LimitSettings
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import EpisodeSettings, EstimatorSettings
 from chargetune.battery.plants.electrochemical import Electrochemical, ElectrochemicalPlant, _built
 
 STEPS, ROUNDS = 120, 3
@@ -24,10 +27,13 @@ CELL = Path(__file__).parents[1] / "examples" / "okane2022.toml"
 def closed_loop(settings):
     """(ms inside PyBaMM's solver, ms of the plant, ms of the loop) per interval."""
     problem = ChargingProblem(
-        load_cell(CELL), mismatch_seed=None, plant_model=settings, soc_start=0.3, steps=STEPS, current_max_A=5.0,
-        voltage_max_V=4.2, kalman=Kalman(), temperature_max_K=330.0,
-    )  # fmt: skip
-    problem.episode()
+        load_cell(CELL),
+        settings,
+        estimator=EstimatorSettings(kalman=Kalman()),
+        limits=LimitSettings(current_max_A=5.0, voltage_max_V=4.2, temperature_max_K=330.0),
+        episode=EpisodeSettings(steps=STEPS, soc_start=0.3),
+    )
+    run_charge(problem)
     solver, inside, stepping = _built(settings, 0.3).solver, [], []
     originals = solver.step, ElectrochemicalPlant.ahead
 
@@ -42,7 +48,7 @@ def closed_loop(settings):
 
     solver.step, ElectrochemicalPlant.ahead = timed(originals[0], inside), timed(originals[1], stepping)
     begin = time.perf_counter()
-    problem.episode()
+    run_charge(problem)
     whole = time.perf_counter() - begin
     solver.step, ElectrochemicalPlant.ahead = originals
     return tuple(1e3 * seconds / STEPS for seconds in (sum(inside), sum(stepping), whole))

@@ -15,8 +15,12 @@ import time
 from pathlib import Path
 
 from chargetune.battery.cell.cell import load_cell
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.kalman import Kalman
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.limits import LimitSettings
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import EstimatorSettings
+from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.learning import ConstrainedLogEI, Sobol
 from chargetune.study.executors import process_executor
@@ -29,9 +33,12 @@ TUNERS = {"sobol": Sobol(0), "default": ConstrainedLogEI(0)}
 
 def problem():
     return ChargingProblem(
-        load_cell(CELL), mismatch_seed=None, plant_model=Electrochemical(model="SPMe"), backoff=Backoff(5), kalman=Kalman(),
-        current_max_A=10.0, voltage_max_V=4.2,
-    )  # fmt: skip
+        load_cell(CELL),
+        Electrochemical(model="SPMe"),
+        estimator=EstimatorSettings(kalman=Kalman()),
+        limits=LimitSettings(current_max_A=10.0, voltage_max_V=4.2),
+        theta=Tunables(backoff=Backoff(5)),
+    )
 
 
 def seconds(studies, evaluate, trials, executors):
@@ -52,7 +59,7 @@ def main():
     parser.add_argument("--turns", type=int, default=4, help="how often they take turns")
     parser.add_argument("--tuner", choices=TUNERS, default="sobol")
     arguments = parser.parse_args()
-    evaluate, load = problem(), os.getloadavg()[0]
+    evaluate, load = Evaluation(problem()), os.getloadavg()[0]
     with (
         tempfile.TemporaryDirectory() as folder,
         process_executor(1) as one,

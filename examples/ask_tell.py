@@ -7,6 +7,7 @@ import sys
 
 import chargetune as ct
 from chargetune.battery.case_study.configurations import case_study
+from chargetune.battery.charging.evaluate import evaluate
 
 
 def main(trials, path):
@@ -25,7 +26,7 @@ def main(trials, path):
                 break
             for trial in waiting:
                 # A charge that did not come to its end has no score: over fewer intervals it would look better.
-                score, episode, ending = problem(trial.theta, trial.seed)
+                score, episode, ending = evaluate(problem, trial.theta, trial.seed)
                 if score is None:
                     study.fail(trial.number, ending)
                     continue

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.tunables import Backoff
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.estimators import Propagated
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
+from charging_problems import charging_problem
 
 INFLOW_MAX = 0.5
 
@@ -65,7 +66,7 @@ def tank_plant(tank):
 @pytest.fixture(scope="session")
 def charging():
     """The case study with a backoff in theta, 120 steps of 10 s from SOC 0.4 so that the voltage limit is met."""
-    return ChargingProblem(default_cell(), mismatch_seed=0, backoff=Backoff(), steps=120, soc_start=0.4)
+    return charging_problem(default_cell(), mismatch_seed=0, backoff=Backoff(), steps=120, soc_start=0.4)
 
 
 @pytest.fixture(scope="session")

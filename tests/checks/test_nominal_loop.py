@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.controller import controller_of
 from chargetune.checks.nominal_loop import check_formulation, check_limits, check_longer_horizon, perfect_plant
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.episode.compiled import simulate
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import Parameter, ParameterSpace
+from charging_problems import charging_problem
 
 
 @pytest.fixture(scope="module")
 def oracle():
     """The case study's controller with a measured overpotential, which knows the cell."""
-    return ChargingProblem(default_cell(), mismatch_seed=None, overpotential="exact").controller
+    return controller_of(charging_problem(default_cell(), mismatch_seed=None, overpotential="exact"))
 
 
 def run(controller, steps=300):

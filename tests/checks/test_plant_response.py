@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
 from chargetune.checks.plant_response import check_response
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.faults import Fault, FaultKind, Faulty
-from chargetune.plants.sensors import Sensors
+from charging_problems import charging_problem
 
 
 @dataclass
@@ -27,15 +28,14 @@ class Reversed:
 
 
 def loop(wrap=lambda plant: plant, seed=0, steps=40, **changes):
-    problem = ChargingProblem(default_cell(), mismatch_seed=1, soc_start=0.4, steps=steps, **changes)
-    return problem.controller, run_episode(problem.controller, wrap(problem.plant), steps=steps, seed=seed)
+    problem = charging_problem(default_cell(), mismatch_seed=1, soc_start=0.4, steps=steps, **changes)
+    return controller_of(problem), run_episode(controller_of(problem), wrap(plant_of(problem)), steps=steps, seed=seed)
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 0.002, 0.01])
 def test_a_wrong_model_with_noise_is_no_wrong_sign(seed, noise):
-    changes = {"sensors": Sensors({"voltage_V": noise, "soc": noise / 100})}
-    assert check_response(*loop(seed=seed, **changes)) == []
+    assert check_response(*loop(seed=seed, voltage_noise_sd_V=noise, soc_noise_sd=noise / 100)) == []
 
 
 def test_a_reversed_current_is_found_in_voltage_and_charge():

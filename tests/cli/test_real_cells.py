@@ -83,12 +83,12 @@ def test_compare_refuses_before_it_charges(tmp_path, refused):
 @pytest.mark.parametrize("file", ["dfn_fast_charge.toml", "dfn_fast_charge_cold.toml"])
 def test_the_electrochemical_examples_are_what_they_say(file):
     problem = load_config(EXAMPLES / file).problem(EXAMPLES)
-    assert problem.plant_model.model == "DFN"
-    assert {limit.name: limit.kind for limit in problem.limits}["anode_min_V"] == "scored"
+    assert problem.plant.model == "DFN"
+    assert {limit.name: limit.kind for limit in problem.limits_by_name.values()}["anode_min_V"] == "scored"
     assert problem.sensors.noise_sd == {"voltage_V": 0.002}
-    assert problem.kalman is not None
+    assert problem.estimator.kalman is not None
     cold = "cold" in file
-    assert problem.plant_model.ambient_K == (283.15 if cold else 298.15)
+    assert problem.plant.ambient_K == (283.15 if cold else 298.15)
 
 
 def test_tuning_an_electrochemical_plant_resumes_and_draws(tmp_path):

@@ -14,11 +14,13 @@ import pytest
 from commands import chargetune, told
 
 from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.evaluate import Evaluation
+from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.learning import Sobol
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
+from charging_problems import charging_problem
 from study_text import study_text
 
 CONFIG = study_text(study={"name": "stopped", "trials": 100_000}, episode={"steps": 120})
@@ -52,11 +54,11 @@ def test_the_command_stops_and_resumes(tmp_path, number):
 
 def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path):
     okane = load_cell(Path(__file__).parents[2] / "examples" / "okane2022.toml")
-    problem = ChargingProblem(okane, mismatch_seed=None, plant_model=Electrochemical(model="SPM"), backoff=Backoff(3), current_max_A=10.0)
+    problem = charging_problem(okane, mismatch_seed=None, plant=Electrochemical(model="SPM"), backoff=Backoff(3), current_max_A=10.0)
     # The first one also builds the plant.
     for _ in range(2):
         began = time.monotonic()
-        problem(problem.space.default, 0)
+        Evaluation(problem)(problem.space.default, 0)
     long, calls = time.monotonic() - began, itertools.count()
     timer = threading.Timer(long / 4, os.kill, (os.getpid(), signal.SIGINT))
 
@@ -64,7 +66,7 @@ def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path
         # From a time after the start of the study on, it might come between two episodes.
         if next(calls) == 2:
             timer.start()
-        return problem(theta, seed)
+        return Evaluation(problem)(theta, seed)
 
     with Store(tmp_path / "s.db") as store, Study.create_or_resume(store, "s", config={}, space=problem.space, tuner=Sobol()) as study:
         with pytest.raises(KeyboardInterrupt):
@@ -72,5 +74,5 @@ def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path
         timer.join()
         trials = study.trials()
         assert [t.status for t in trials] == ["done", "done", "running"]
-        study.run(problem, len(trials))
+        study.run(Evaluation(problem), len(trials))
         assert {t.status for t in study.trials()} == {"done"}

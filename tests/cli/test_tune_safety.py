@@ -1,6 +1,7 @@
 """`chargetune tune` with a table [safety]."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 from commands import run
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.evaluate import evaluate
+from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.studies.open_study import make_tuner
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.tune import _closing
 from chargetune.study.result import Reason, StudyResult
 from chargetune.study.trial import Trial, TrialStatus
+from charging_problems import charging_problem
 
 STUDY = """
 [study]
@@ -71,7 +74,7 @@ def test_a_trial_ended_at_the_limit_spends_the_budget_and_stops_the_study(tmp_pa
     [
         ("probability = 0.95", "default", "allowed is tuner = 'twin'"),
         ("probability = 1.5", "twin", "probability = 1.5"),
-        ("budget_mVs = -1.0", "twin", "budget = -1.0"),
+        ("budget_mVs = -1.0", "twin", "budget_mVs = -1.0"),
         ("abort_margin_V = 0.0", "twin", "abort_margin_V = 0"),
         ("start = { R0_rat = 2.0 }", "twin", "R0_rat"),
     ],
@@ -88,11 +91,11 @@ def test_what_is_unknown_of_the_plant_is_told_to_the_twin(tmp_path):
     study.write_text(example + "\n[twin]\ncapacity_spread = 0.03\nsoc_spread = 0.01\nocv_spread_V = 0.003\n")
     config = load_config(study)
     problem = config.problem(tmp_path)
-    tuner = make_tuner("twin", 0, problem, None, None, config.twin)
+    tuner = make_tuner("twin", 0, problem, config.twin)
     assert [(one.name, one.sd) for one in tuner.loop.twin.unknowns[3:]] == [("capacity_Ah", 0.03), ("soc", 0.01), ("voltage_V", 0.003)]
     assert config.document(tmp_path)["twin"]["soc_spread"] == 0.01
     with pytest.raises(ValueError, match=r"\[twin\] is given with tuner = 'sobol'"):
-        make_tuner("sobol", 0, problem, None, None, config.twin)
+        make_tuner("sobol", 0, replace(problem, safety=None), config.twin)
     study.write_text(study.read_text().replace("soc_spread = 0.01", "soc_spread = -0.01"))
     with pytest.raises(ValueError, match=r"twin.soc_spread = -0\.01"):
         load_config(study)
@@ -106,13 +109,13 @@ def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
     config = load_config(study)
     problem = config.problem(tmp_path)
     with pytest.raises(ValueError, match=r"anode_min_V, which the cell's circuit does not predict"):
-        make_tuner(config.study.tuner, 0, problem, config.safety)
+        make_tuner(config.study.tuner, 0, problem)
 
 
 def test_tune_says_which_trial_is_the_result_and_why(capsys):
-    problem = ChargingProblem(default_cell(), mismatch_seed=1, ratios=(ResistanceRatio("R0", 0.1, 4.0),))
+    problem = charging_problem(default_cell(), mismatch_seed=1, R0=ResistanceRatio(0.1, 4.0))
     thetas = [np.full(9, 2.5), np.full(9, 3.0)]
-    trials = [Trial(k, tuple(theta), status=TrialStatus.DONE, score=problem(theta, k)[0]) for k, theta in enumerate(thetas)]
+    trials = [Trial(k, tuple(theta), status=TrialStatus.DONE, score=evaluate(problem, theta, k)[0]) for k, theta in enumerate(thetas)]
     _closing(problem, trials, StudyResult(trials[1], Reason.BELIEVED))
     said = " ".join(capsys.readouterr().out.split())
     assert "the result is trial 1: the tuner believes it best from all traces" in said

@@ -6,20 +6,24 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
+from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
+from charging_problems import charging_problem
 
 NAMES = [
     *("oracle", "seed0", "seed1", "seed2", "seed3", "seed4", "seed5", "seed0-backoff", "seed1-backoff", "seed2-backoff"),
     *(f"seed{s}-model-U1" for s in range(6)),
 ]
 WAYS = {
-    "compiled": lambda problem, theta: simulate(problem.controller, problem.plant, steps=360, theta=theta, compiled=True),
-    "virtual machine": lambda problem, theta: simulate(problem.controller, problem.plant, steps=360, theta=theta, compiled=False),
-    "step by step": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta),
-    "IPOPT": lambda problem, theta: run_episode(problem.controller, problem.plant, steps=360, theta=theta, control=ipopt_act),
+    "compiled": lambda problem, theta: simulate(controller_of(problem), plant_of(problem), steps=360, theta=theta, compiled=True),
+    "virtual machine": lambda problem, theta: simulate(controller_of(problem), plant_of(problem), steps=360, theta=theta, compiled=False),
+    "step by step": lambda problem, theta: run_episode(controller_of(problem), plant_of(problem), steps=360, theta=theta),
+    "IPOPT": lambda problem, theta: run_episode(controller_of(problem), plant_of(problem), steps=360, theta=theta, control=ipopt_act),
 }
 # IPOPT takes a hundred times as long: one mismatch with a backoff and a measured U1, one with the controller's own U1. A right model
 # (oracle) asks nothing of it that these do not.
@@ -41,7 +45,7 @@ def cases(shared):
 def problem_of_case(case):
     seed = None if case["name"] == "oracle" else int(case["name"][4])
     treatment = "exact" if case["U1"] == "measured" else "model"
-    return ChargingProblem(default_cell(), mismatch_seed=seed, backoff=Backoff(7), overpotential=treatment, c1=1e-4)
+    return charging_problem(default_cell(), mismatch_seed=seed, backoff=Backoff(7), overpotential=treatment, c1=1e-4)
 
 
 def test_no_case_is_forgotten(cases):
@@ -63,6 +67,6 @@ def test_trajectory(name, way, cases):
     np.testing.assert_allclose(end, case["voltage_end"], atol=1e-4)
     np.testing.assert_allclose([0.05, *soc], case["soc"], atol=1e-4)
     assert episode.failures == 0
-    score = problem.score(episode)
+    score = score_episode(problem, episode)
     assert score.performance == pytest.approx(case["G_c1_1e4"], rel=1e-3)
     assert score.metrics["overshoot_mV"] == pytest.approx(case["max_overshoot_mV"], abs=0.02)

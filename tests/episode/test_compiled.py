@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
@@ -46,8 +48,8 @@ THETA = (0.05, -0.02, 0.1, 0.03, 0.0, 0.02, 0.01)
 
 def loop(charging, name):
     estimator, sensors, process = LOOPS[name]
-    controller = replace(charging.controller, estimator=estimator)
-    return controller, replace(charging.plant, sensors=sensors, process_noise_sd=process)
+    controller = replace(controller_of(charging), estimator=estimator)
+    return controller, replace(plant_of(charging), sensors=sensors, process_noise_sd=process)
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -177,9 +179,14 @@ def test_refuses_what_step_by_step_refuses(tank_controller, tank_plant, argument
 PROGRAM = """
 import sys
 from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
 from chargetune.battery.charging.problem import ChargingProblem
-problem = ChargingProblem(default_cell(), mismatch_seed=0, steps=8, horizon=2)
-print(problem._episodes.compiled, problem.episode().input[-1, 0].hex())
+from chargetune.battery.charging.settings import ControllerSettings
+from chargetune.episode.compiled import compiled_episode
+problem = ChargingProblem(default_cell(), controller=ControllerSettings(horizon=2, mismatch_seed=0))
+episodes = compiled_episode(controller_of(problem), plant_of(problem), 8)
+print(episodes.compiled, episodes.run().input[-1, 0].hex())
 """
 
 

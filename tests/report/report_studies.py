@@ -6,16 +6,11 @@ from itertools import count
 import numpy as np
 from scipy.stats import qmc
 
-from chargetune.battery.studies.study_file import (
-    BackoffTable,
-    Config,
-    ControllerTable,
-    EpisodeTable,
-    LimitsTable,
-    RatioTable,
-    StudyTable,
-    ThetaTable,
-)
+from chargetune.battery.charging.evaluate import Evaluation
+from chargetune.battery.charging.limits import LimitSettings
+from chargetune.battery.charging.settings import ControllerSettings, EpisodeSettings
+from chargetune.battery.charging.tunables import Backoff, ResistanceRatio, Tunables
+from chargetune.battery.studies.study_file import Config, StudyTable
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import Parameter, ParameterSpace
@@ -47,10 +42,10 @@ def charging(tuner="sobol", *, tolerance_V=0.0005):
     """A configuration that tunes a backoff, R0 and R1; all have one structure, so that one compilation serves every test."""
     return Config(
         study=StudyTable(name="charge", tuner=tuner),
-        controller=ControllerTable(mismatch_seed=0, horizon=3),
-        limits=LimitsTable(tolerance_V=tolerance_V),
-        episode=EpisodeTable(steps=150),
-        theta=ThetaTable(backoff=BackoffTable(nodes=5), R0=RatioTable(), R1=RatioTable()),
+        controller=ControllerSettings(mismatch_seed=0, horizon=3),
+        limits=LimitSettings(tolerance_V=tolerance_V),
+        episode=EpisodeSettings(steps=150),
+        theta=Tunables(backoff=Backoff(nodes=5), R0=ResistanceRatio(), R1=ResistanceRatio()),
     )
 
 
@@ -62,7 +57,7 @@ def run_charging(path, config, *, reach=0.7, cut=(), raising=(), trials=TRIALS):
         number = next(numbers)
         if number in raising:
             raise RuntimeError("the cycler lost its connection")
-        score, episode, ending = problem(theta, seed)
+        score, episode, ending = Evaluation(problem)(theta, seed)
         if number in cut:
             return None, episode.cut(CUT, Ending.LIMIT, "too hot"), "limit trip: too hot"
         return score, episode, ending

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from chargetune.battery.case_study.configurations import case_study
-from chargetune.plants.sensors import Sensors
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.report import read_study
 from chargetune.report.limit_recheck import recheck
+from charging_problems import changed
 
 
 @pytest.mark.parametrize("kind", ["mixed", "violating", "ei"])
@@ -27,9 +29,9 @@ def test_stored_scores_are_confirmed(stores, kind):
 
 
 def test_noise_is_judged_as_the_score_judges_it():
-    problem = replace(case_study("backoff", 0).problem(), steps=60, sensors=Sensors({"voltage_V": 2e-3}), verdict_samples=6)
-    episode = problem.episode(None, seed=3)
-    score = problem.score(episode)
+    problem = changed(case_study("backoff", 0).problem(), steps=60, voltage_noise_sd_V=2e-3, verdict_samples=6)
+    episode = run_charge(problem, None, seed=3)
+    score = score_episode(problem, episode)
     check = next(c for c in recheck(problem, episode, score) if c.name == "voltage_max_V")
     assert check.agrees
     assert check.judged == "mean of 6 intervals"
@@ -51,8 +53,8 @@ def test_disagreement_and_a_current_beyond_its_bound(stores):
 
 
 def test_a_lost_sample_hides_no_other():
-    problem = replace(case_study("backoff", 0).problem(), steps=60, sensors=Sensors({"voltage_V": 2e-3}), verdict_samples=6)
-    episode = problem.episode(None, seed=3)
+    problem = changed(case_study("backoff", 0).problem(), steps=60, voltage_noise_sd_V=2e-3, verdict_samples=6)
+    episode = run_charge(problem, None, seed=3)
     whole = {c.name: c for c in recheck(problem, episode, None)}
     episode.output_end[20, 0] = np.nan
     found = {c.name: c for c in recheck(problem, episode, None)}

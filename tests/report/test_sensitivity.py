@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from report_studies import other_study
 
+from chargetune.battery.charging.evaluate import evaluate
 from chargetune.report import read_study
 from chargetune.report.sensitivity import STEP, again, finite_differences, rank_correlations
 
@@ -21,7 +22,7 @@ def test_finite_differences_are_changes_of_the_score(view):
     theta = np.array(view.tuned.theta)
     # On the logarithmic scale of a ratio 2 % of the range is a factor.
     theta[i] *= (6.0 / 0.1) ** STEP
-    score, _, _ = view.problem(theta, view.tuned.seed)
+    score, _, _ = evaluate(view.problem, theta, view.tuned.seed)
     assert found[entry].objective[1] == pytest.approx(score.objective - view.tuned.score.objective, abs=1e-9)
     assert found[entry].excess[1] == pytest.approx(max(score.excess.values()) - max(view.tuned.score.excess.values()), abs=1e-9)
 

@@ -10,6 +10,7 @@ import pytest
 from study_toy import SPACE, Toy, open_study
 
 from chargetune.battery.case_study.configurations import case_study
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
 from chargetune.study.dataframe import trials_dataframe
@@ -82,7 +83,7 @@ def test_trials_and_scores_show_themselves_and_what_is_unknown(store):
 
 def test_an_episode_shows_a_curve_for_each_signal():
     problem = case_study("backoff", 1).problem()
-    episode = problem.episode(seed=0)
+    episode = run_charge(problem, seed=0)
     html = episode._repr_html_()
     shown = Outline(html)
     assert shown.after("intervals") == "360 of 10 s"

@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -80,10 +80,13 @@ def test_describe_tells_apart_and_holds_no_address():
         function: object = np.sin
         limit: float = float("inf")
         plain: object = None
+        known: int = field(default=0, metadata={"identity": False})
 
     class Plain:
         pass
 
+    # What the configuration holds already is left out.
+    assert describe(Tuner(Halfway(1), known=1)) == describe(Tuner(Halfway(1), known=2))
     one = describe(Tuner(Halfway(1), plain=Plain()))
     assert one == describe(Tuner(Halfway(1), plain=Plain()))
     assert one != describe(Tuner(Halfway(2), plain=Plain()))

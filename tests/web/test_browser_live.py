@@ -6,6 +6,7 @@ from itertools import count
 
 from report_studies import LocalSobol, charging
 
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.episode.score import Score
 from chargetune.study.serialization import space_to_json
 from chargetune.study.store.store import Store
@@ -51,7 +52,7 @@ def test_a_running_study_is_followed_within_two_seconds(open_page, tmp_path, ser
         go.acquire()
         if next(numbers) == 2:
             raise RuntimeError("the cycler lost its connection")
-        return problem(theta, seed)
+        return Evaluation(problem)(theta, seed)
 
     def run():
         with (

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, metrics_table
 
@@ -20,11 +22,11 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
     """Run one closed loop and print what it was worth; with ``as_json`` also the trajectory."""
     config = load_config(path)
     problem = config.problem(path.parent)
-    values = config.values(problem) if theta is None else parse_theta(theta, problem, "--theta")
-    episode = problem.episode(values, seed)
+    values = problem.theta_values if theta is None else parse_theta(theta, problem, "--theta")
+    episode = run_charge(problem, values, seed)
     if not len(episode):
         raise ValueError(f"the episode has no interval; it ended with {episode.ending.value}: {episode.message}")
-    score = problem.score(episode)
+    score = score_episode(problem, episode)
     start, end = episode.signal("voltage_V")
     _, soc = episode.signal("soc")
     if as_json:
@@ -32,7 +34,7 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
             "overshoot_mV": score.metrics["overshoot_mV"],
             "t80_min": score.metrics["t80_min"],
             "t95_min": score.metrics["t95_min"],
-            "soc": [problem.soc_start, *soc.tolist()],
+            "soc": [problem.episode.soc_start, *soc.tolist()],
             "current_A": episode.input[:, 0].tolist(),
             "voltage_start_V": start.tolist(),
             "voltage_end_V": end.tolist(),
@@ -52,10 +54,10 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
         return
     out = console()
     out.print(
-        f"[bold]{problem.plant_cell.name}[/], {len(episode)} intervals of {problem.sampling_time_s:g} s, ended: {episode.ending.value}"
+        f"[bold]{problem.cell.name}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, ended: {episode.ending.value}"
     )
-    if problem.plant_cell.remark:
-        out.print(f"[dim]{problem.plant_cell.remark}[/]")
+    if problem.cell.remark:
+        out.print(f"[dim]{problem.cell.remark}[/]")
     out.print(metrics_table({"this run": score}, problem))
 
 

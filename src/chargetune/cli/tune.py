@@ -17,7 +17,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging.checks import check_charging
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.verdict import charge_time, violation_mVs
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
@@ -69,7 +71,7 @@ def tune_command(
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
-    _check(problem, config.safe_start(problem), force=force)
+    _check(problem, problem.safe_start, force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
     everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
     figures: list[Path] = []
@@ -125,7 +127,7 @@ def _run(
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
             if incumbent is not None and incumbent.score is not None:
-                name, minutes = problem.charge_time(incumbent.score)
+                name, minutes = charge_time(problem, incumbent.score)
                 best = f"best {name} {number(minutes)} min (trial {incumbent.number})"
             progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
 
@@ -139,7 +141,7 @@ def _run(
             # not with a tuner whose every step needs the trial before it.
             alone = study.batch > 1 or config.safety is not None or config.study.tuner == "iterative_learning"
             ahead = workers if workers > 1 and not alone else None
-            study.run(problem, count, executor=executor, workers=ahead, progress=note)
+            study.run(Evaluation(problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
         everything = study.trials()[:count]
@@ -175,7 +177,7 @@ def _safety(config: Config, problem: ChargingProblem, study: Study, trials: Sequ
             spent += trial.score.metrics.get("violation_mVs") or 0.0
         elif trial.status is TrialStatus.FAILED:
             episode = study.episode(trial.number)
-            spent += problem.violation_mVs(episode) if episode is not None and len(episode) else 0.0
+            spent += violation_mVs(problem, episode) if episode is not None and len(episode) else 0.0
             ended += (trial.ending or "").startswith(Ending.LIMIT.value)
     return {
         "probability": table.probability,
@@ -197,9 +199,9 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
-    screen.print(f"\n[bold]{problem.plant_cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
-    if problem.plant_cell.remark:
-        screen.print(f"[dim]{problem.plant_cell.remark}[/]")
+    screen.print(f"\n[bold]{problem.cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    if problem.cell.remark:
+        screen.print(f"[dim]{problem.cell.remark}[/]")
     first = everything[0].score if everything else None
     # A safe study does not begin with the untuned controller.
     label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"

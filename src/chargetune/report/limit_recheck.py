@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.verdict import judgement
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 
@@ -52,15 +53,14 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
     current = episode.input[:, episode.input_names.index("current_A")]
     at_start = episode.time_s
     out = []
-    for name, bound, upper in (("current_min_A", problem.current_min_A, False), ("current_max_A", problem.current_max_A, True)):
-        if bound is not None:
-            # What a held input cannot resolve is no excess.
-            worst = int(np.argmax(current) if upper else np.argmin(current))
-            excess = float(current[worst] - bound if upper else bound - current[worst])
-            out.append(Check(name, bound, 1e-9, float(current[worst]), float(at_start[worst]), excess, "input", None, None))
+    for name, bound, upper in (("current_min_A", problem.limits.current_min_A, False), ("current_max_A", problem.current_max_A, True)):
+        # What a held input cannot resolve is no excess.
+        worst = int(np.argmax(current) if upper else np.argmin(current))
+        excess = float(current[worst] - bound if upper else bound - current[worst])
+        out.append(Check(name, bound, 1e-9, float(current[worst]), float(at_start[worst]), excess, "input", None, None))
     stored = {} if score is None else score.excess
-    for limit in problem.limits:
-        samples, tolerance = problem.judged(limit)
+    for limit in problem.limits_by_name.values():
+        samples, tolerance = judgement(problem, limit)
         reached, at_s = _worst(episode, limit.signal, samples, upper=limit.upper, true=False)
         true, _ = _worst(episode, limit.signal, 1, upper=limit.upper, true=True) if episode.true_end is not None else (None, 0.0)
         judged = "samples" if samples == 1 else f"mean of {samples} intervals"

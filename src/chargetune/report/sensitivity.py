@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 
+from chargetune.battery.charging.evaluate import evaluate
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.report.figures.convergence import worst_excess
 from chargetune.report.study_view import StudyView
@@ -39,7 +40,7 @@ def again(problem: ChargingProblem, trial: Trial) -> float | None:
 
     Compared are objective and excesses. A difference above rounding says that the program or the machine is another.
     """
-    score, _, _ = problem(np.array(trial.theta), trial.seed)
+    score, _, _ = evaluate(problem, np.array(trial.theta), trial.seed)
     if score is None or trial.score is None:
         return None
     pairs = [(score.objective, trial.score.objective), *((score.excess[n], e) for n, e in trial.score.excess.items())]
@@ -54,7 +55,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
     problem, space = view.problem, view.space
     if problem is None:
         raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
-    base, _, _ = problem(np.array(trial.theta), trial.seed)
+    base, _, _ = evaluate(problem, np.array(trial.theta), trial.seed)
     centre, out = space.to_unit(np.array(trial.theta)), []
     for i, entry in enumerate(space.entries):
         changes: list[tuple[float | None, float | None, float | None]] = []
@@ -62,7 +63,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
             moved = centre.copy()
             moved[i] += step
             inside = -1e-12 <= moved[i] <= 1 + 1e-12
-            score = problem(space.from_unit(moved), trial.seed)[0] if inside else None
+            score = evaluate(problem, space.from_unit(moved), trial.seed)[0] if inside else None
             if score is None or base is None:
                 changes.append((None, None, None))
             else:

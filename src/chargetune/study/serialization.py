@@ -42,7 +42,8 @@ def sha256(data: str | bytes) -> str:
 def describe(value: object) -> Any:
     """A JSON description of frozen data, such as a tuner: type and fields, functions by their name.
 
-    It is compared when a study is resumed, so it must not contain an address in memory.
+    It is compared when a study is resumed, so it must not contain an address in memory. Fields of a dataclass with the metadata
+    ``{"identity": False}`` are left out: what they hold is in the configuration already.
     """
     if isinstance(value, (bool, int, str)) or value is None:
         return value
@@ -51,7 +52,7 @@ def describe(value: object) -> Any:
     if isinstance(value, (np.integer, np.bool_)):
         return value.item()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value) if f.metadata.get("identity", True)}
         return {"type": type(value).__qualname__, **fields}
     if isinstance(value, Mapping):
         return {str(key): describe(item) for key, item in value.items()}

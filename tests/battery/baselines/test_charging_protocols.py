@@ -9,15 +9,16 @@ from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, attia_f
 from chargetune.battery.baselines.comparison import compare, row_names
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.charging.metrics import crossing_minutes
-from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
+from charging_problems import charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -57,7 +58,7 @@ def test_the_oracle_of_the_circuit_is_what_a_perfect_controller_does():
     """t95 of the case study's oracle, 36.24 min, found without any MPC."""
     episode = charge(circuit(), constant_current(6.0), [VOLTAGE], steps=360, soc_target=1.0, current_max_A=6.0)
     assert minutes(episode, 0.95) == pytest.approx(36.24, abs=0.02)
-    own = ChargingProblem(CELL, mismatch_seed=None).episode()
+    own = run_charge(charging_problem(CELL, mismatch_seed=None))
     np.testing.assert_allclose(episode.input, own.input, atol=0.02)
 
 
@@ -99,7 +100,7 @@ def test_cccv_on_the_dfn():
 
 
 def test_the_table_of_the_circuit():
-    problem = ChargingProblem(CELL, mismatch_seed=1, ratios=(ResistanceRatio("R1"),))
+    problem = charging_problem(CELL, mismatch_seed=1, R1=ResistanceRatio())
     theta = problem.space.default
     rows = {row.name: row for row in compare(problem, theta)}
     assert list(rows) == row_names(problem, theta)

@@ -11,12 +11,13 @@ import pytest
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.certification.certificate import figures, run_charges, write_certificate
 from chargetune.battery.certification.variations import PlantVariation, Variations
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.episode.episode import Ending
-from chargetune.plants.sensors import Sensors
 from chargetune.study.evaluation import trial_seed
 from chargetune.verify import upper_bound, verify
+from charging_problems import changed, charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -30,7 +31,7 @@ THETA = (0.0, 0.0)
 def forced(**changes):
     """A controller that has to charge with 4 A for 6 intervals: it breaks the limit where the charge starts late."""
     settings = {"mismatch_seed": None, "backoff": Backoff(nodes=2), "steps": 6, "soc_start": 0.6, "current_min_A": 4.0}
-    return ChargingProblem(CELL, **(settings | changes))
+    return charging_problem(CELL, **(settings | changes))
 
 
 def charges(problem, spread, episodes, seed=0):
@@ -42,7 +43,7 @@ def threshold():
     low, high = 0.5, 0.7
     for _ in range(30):
         middle = (low + high) / 2
-        score, _, _ = forced(soc_start=middle)(np.zeros(2), 0)
+        score, _, _ = evaluate(forced(soc_start=middle), np.zeros(2), 0)
         low, high = (low, middle) if not score.feasible else (middle, high)
     return high
 
@@ -52,7 +53,7 @@ def test_the_bound_on_a_controller_with_a_known_violation_rate():
     edge = threshold()
     rate = (0.7 - edge) / 0.2
     assert 0.1 < rate < 0.9
-    tolerances = {limit.name: limit.tolerance for limit in forced().limits}
+    tolerances = {limit.name: limit.tolerance for limit in forced().limits_by_name.values()}
     everything = charges(forced(), ONLY_START, 300)
     counted = np.array([not charge.score.feasible for charge in everything])
     # Each episode violates exactly where the start is beyond the threshold.
@@ -123,7 +124,7 @@ def test_the_drawn_plant_differs_and_the_controller_does_not_know():
     harder = replace(draw, soc_start=0.6, factors={**dict.fromkeys(draw.factors, 1.0), "R0_ohm": 1.2})
     same = replace(harder, factors=dict.fromkeys(draw.factors, 1.0))
     variations = Variations(problem)
-    nominal = problem.episode(None)
+    nominal = run_charge(problem, None)
     np.testing.assert_allclose(variations.run(same, THETA)[1].input, nominal.input, atol=1e-6)
     score, episode = variations.run(harder, THETA)
     # A perfect model before; now R0 is a fifth larger than believed: about 0.2 x 61 mOhm x I more than the limit.
@@ -139,9 +140,9 @@ def test_the_drawn_plant_differs_and_the_controller_does_not_know():
 
 def test_an_electrochemical_plant_is_varied_and_another_is_refused():
     with pytest.raises(ValueError, match="allowed are the cell's circuit and an electrochemical model"):
-        Variations(forced(plant_model=object()))
+        Variations(forced(plant=object()))
     # A single particle that is charged for half a minute.
-    problem = forced(plant_model=Electrochemical("SPM"), steps=3, current_min_A=0.0, kalman=None)
+    problem = forced(plant=Electrochemical("SPM"), steps=3, current_min_A=0.0, kalman=None)
     one = PlantVariation().draw(problem, 0, 0)
     plain, smaller, harder = (
         Variations(problem).run(replace(one, soc_start=0.5, factors={**dict.fromkeys(one.factors, 1.0), **factors}), THETA)[1]
@@ -156,7 +157,7 @@ def test_an_electrochemical_plant_is_varied_and_another_is_refused():
 def test_nothing_to_draw_is_refused():
     with pytest.raises(ValueError, match="all episodes are the same"):
         charges(forced(), NONE, 3)
-    assert len(charges(forced(sensors=Sensors({"voltage_V": 1e-3})), NONE, 3)) == 3
+    assert len(charges(forced(voltage_noise_sd_V=1e-3), NONE, 3)) == 3
 
 
 @pytest.mark.parametrize(
@@ -170,7 +171,7 @@ def test_a_bad_spread_is_refused(changes, words):
 
 @pytest.fixture
 def certificate(tmp_path):
-    problem = forced(sensors=Sensors({"voltage_V": 0.002}), soc_start=0.5)
+    problem = forced(voltage_noise_sd_V=0.002, soc_start=0.5)
     everything = charges(problem, MODEST, 12)
     path = tmp_path / "c.json"
     write_certificate(
@@ -293,8 +294,8 @@ def test_the_drawn_start_is_scored_from_there():
     draw = PlantVariation().draw(problem, 0, 0)
     draw = replace(draw, soc_start=0.75, factors=dict.fromkeys(draw.factors, 1.0))
     score, episode = Variations(problem).run(draw, THETA)
-    same = replace(problem, soc_start=0.75)
-    expected, other, _ = same(np.array(THETA), draw.seed)
+    same = changed(problem, soc_start=0.75)
+    expected, other, _ = evaluate(same, np.array(THETA), draw.seed)
     np.testing.assert_allclose(episode.input, other.input, atol=1e-6)
     assert score.objective == pytest.approx(expected.objective, rel=1e-6)
     assert score.metrics["t80_min"] == pytest.approx(expected.metrics["t80_min"], rel=1e-5)
@@ -318,7 +319,7 @@ def killed(path, at, monkeypatch, everything):
         patch.setattr(type(path), "unlink", step(type(path).unlink))
         try:
             write_certificate(
-                path, forced(sensors=Sensors({"voltage_V": 0.002}), soc_start=0.5), everything,
+                path, forced(voltage_noise_sd_V=0.002, soc_start=0.5), everything,
                 theta={"backoff_V[0]": 0.0, "backoff_V[1]": 0.0}, origin={"study": "s", "trial": 1}, spread=MODEST, seed=1, confidence=0.95,
             )  # fmt: skip
         except SystemExit:
@@ -327,7 +328,7 @@ def killed(path, at, monkeypatch, everything):
 
 
 def test_a_certificate_is_replaced_as_a_whole(certificate, monkeypatch):
-    everything = charges(forced(sensors=Sensors({"voltage_V": 0.002}), soc_start=0.5), MODEST, 12, seed=1)
+    everything = charges(forced(voltage_noise_sd_V=0.002, soc_start=0.5), MODEST, 12, seed=1)
     certificate.with_suffix(".png").write_bytes(b"figure of the old one")
     bystander = certificate.with_name("c-notes.npz")
     bystander.write_bytes(b"somebody else's")

@@ -9,12 +9,13 @@ import pytest
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
+from chargetune.battery.charging.evaluate import evaluate, run_charge
 from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import Limit
-from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.tunables import CurrentLimit, LimitBackoff, MeasurementSpread
+from chargetune.battery.charging.tunables import Backoff, CurrentLimit, LimitBackoff, MeasurementSpread, ResistanceRatio, Tunables
+from chargetune.battery.charging.verdict import judgement, violation_mVs
 from chargetune.battery.studies.study_file import load_config, problem_of_document
-from chargetune.plants.sensors import Sensors
+from charging_problems import charging_problem
 
 CELL = default_cell()
 WARM = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1, activation_J_mol=20e3))
@@ -25,8 +26,8 @@ pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 
 def scored(cell=WARM, theta=None, **changes):
-    problem = ChargingProblem(cell, mismatch_seed=None, **changes)
-    score, episode, ending = problem(problem.space.default if theta is None else np.asarray(theta, dtype=float), 0)
+    problem = charging_problem(cell, mismatch_seed=None, **changes)
+    score, episode, ending = evaluate(problem, problem.space.default if theta is None else np.asarray(theta, dtype=float), 0)
     assert ending == "done"
     return score, episode
 
@@ -82,22 +83,22 @@ def test_current_limit_holds_what_the_model_does_not_see():
 
 
 def test_backoffs_of_temperature_and_anode_keep_their_distance():
-    margins = (LimitBackoff("temperature", -2.0, 5.0), LimitBackoff("anode", -0.02, 0.05, nodes=3))
-    score, _ = scored(ANODE, theta=[2.0, 0.01, 0.01, 0.01], temperature_max_K=HOT, anode_min_V=0.0, limit_backoffs=margins)
+    margins = {"temperature_backoff": LimitBackoff(-2.0, 5.0), "anode_backoff": LimitBackoff(-0.02, 0.05, nodes=3)}
+    score, _ = scored(ANODE, theta=[2.0, 0.01, 0.01, 0.01], temperature_max_K=HOT, anode_min_V=0.0, **margins)
     assert score.excess["temperature_max_K"] == pytest.approx(-2.0, abs=0.02)
     assert score.excess["anode_min_V"] == pytest.approx(-0.01, abs=2e-4)
 
 
 def test_one_scale_of_a_resistance_is_all_nodes_alike():
-    one = ChargingProblem(CELL, mismatch_seed=1, ratios=(ResistanceRatio("R0", scale=True),))
-    all_nodes = ChargingProblem(CELL, mismatch_seed=1, ratios=(ResistanceRatio("R0"),))
+    one = charging_problem(CELL, mismatch_seed=1, R0=ResistanceRatio(scale=True))
+    all_nodes = charging_problem(CELL, mismatch_seed=1, R0=ResistanceRatio())
     assert one.space.dimension == 1
-    np.testing.assert_allclose(one.episode([1.3]).input, all_nodes.episode([1.3] * 9).input, atol=2e-4)
+    np.testing.assert_allclose(run_charge(one, [1.3]).input, run_charge(all_nodes, [1.3] * 9).input, atol=2e-4)
 
 
 def test_the_filter_finds_a_wrong_soc_at_the_start_by_the_voltage():
-    noise = Sensors(noise_sd={"voltage_V": 0.002, "temperature_K": 0.1})
-    wrong = {"soc_start_error": 0.05, "sensors": noise, "temperature_max_K": HOT, "verdict_samples": 5}
+    noise = {"voltage_noise_sd_V": 0.002, "temperature_noise_sd_K": 0.1}
+    wrong = {"soc_start_error": 0.05, **noise, "temperature_max_K": HOT, "verdict_samples": 5}
     _, episode = scored(kalman=Kalman(voltage_sd_V=0.01, soc_start_sd=0.05), **wrong)
     error = episode.estimate[1:, 0] - episode.signal("soc", true=True)[1][:-1]
     assert abs(error[60]) < 0.01
@@ -108,22 +109,21 @@ def test_the_filter_finds_a_wrong_soc_at_the_start_by_the_voltage():
 
 
 def test_the_filters_spread_may_be_part_of_theta():
-    problem = ChargingProblem(
-        CELL, mismatch_seed=3, kalman=Kalman(), voltage_spread=MeasurementSpread(1e-3, 1.0, 0.05), soc_start_error=0.03, steps=100
+    problem = charging_problem(
+        CELL, mismatch_seed=3, kalman=Kalman(), voltage_sd=MeasurementSpread(1e-3, 1.0), soc_start_error=0.03, steps=100
     )
     assert list(problem.space.entries) == ["voltage_sd_V"]
     fixed = {
-        sd: ChargingProblem(CELL, mismatch_seed=3, kalman=Kalman(voltage_sd_V=sd), soc_start_error=0.03, steps=100) for sd in (0.05, 0.5)
+        sd: charging_problem(CELL, mismatch_seed=3, kalman=Kalman(voltage_sd_V=sd), soc_start_error=0.03, steps=100) for sd in (0.05, 0.5)
     }
     for sd, one in fixed.items():
-        np.testing.assert_allclose(problem.episode([sd]).estimate, one.episode().estimate, atol=1e-6)
-    assert np.max(np.abs(fixed[0.05].episode().estimate - fixed[0.5].episode().estimate)) > 1e-3
+        np.testing.assert_allclose(run_charge(problem, [sd]).estimate, run_charge(one).estimate, atol=1e-6)
+    assert np.max(np.abs(run_charge(fixed[0.05]).estimate - run_charge(fixed[0.5]).estimate)) > 1e-3
 
 
 def test_the_verdict_on_noise_is_nearer_the_truth():
-    noise = Sensors(noise_sd={"voltage_V": 0.002})
-    plain, _ = scored(CELL, sensors=noise)
-    mean, episode = scored(CELL, sensors=noise, verdict_samples=5)
+    plain, _ = scored(CELL, voltage_noise_sd_V=0.002)
+    mean, episode = scored(CELL, voltage_noise_sd_V=0.002, verdict_samples=5)
     true = float(np.max(episode.signal("voltage_V", true=True))) - 4.2
     assert plain.excess["voltage_max_V"] > 0.005
     assert true < mean.excess["voltage_max_V"] < 0.6 * plain.excess["voltage_max_V"]
@@ -133,18 +133,17 @@ def test_the_verdict_on_noise_is_nearer_the_truth():
 @pytest.mark.parametrize("lost", [[3], [3, 4, 5], list(range(2, 9)), [0], [39]])
 def test_what_was_lost_costs_the_budget_of_violation_what_is_beside_it_does(by_hand, samples, lost):
     """30 mV over the limit in every interval: the overshoot is known, and no lost sample is a kept limit."""
-    noise = Sensors(noise_sd={"voltage_V": 0.002})
-    problem = ChargingProblem(CELL, mismatch_seed=None, sensors=noise, verdict_samples=samples)
-    limit = problem.limits[0]
+    problem = charging_problem(CELL, mismatch_seed=None, voltage_noise_sd_V=0.002, verdict_samples=samples)
+    limit = problem.limits_by_name["voltage_max_V"]
     both = np.column_stack([np.full(40, limit.bound + 0.03), np.full(40, 0.5)])
     episode = replace(by_hand, output_start=both, output_end=both.copy(), time_s=10.0 * np.arange(40))
-    whole = problem.violation_mVs(episode)
-    assert whole == pytest.approx(40 * 10.0 * 1e3 * (0.03 - problem.judged(limit)[1]))
+    whole = violation_mVs(problem, episode)
+    assert whole == pytest.approx(40 * 10.0 * 1e3 * (0.03 - judgement(problem, limit)[1]))
     for one in (episode.output_start, episode.output_end):
         one[lost, 0] = np.nan
-    assert problem.violation_mVs(episode) == pytest.approx(whole)
+    assert violation_mVs(problem, episode) == pytest.approx(whole)
     episode.output_start[:, 0] = episode.output_end[:, 0] = np.nan
-    assert problem.violation_mVs(episode) == 0.0
+    assert violation_mVs(problem, episode) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -161,16 +160,16 @@ def test_what_was_lost_costs_the_budget_of_violation_what_is_beside_it_does(by_h
         (WARM, {"soc_start_error": -0.1}, "believed SOC at the start (soc_start + soc_start_error) = -0.05"),
         (
             WARM,
-            {"limit_backoffs": (LimitBackoff("temperature", -1.0, 1.0),)},
-            "limit_backoffs = ['temperature'], allowed is each limit once",
+            {"temperature_backoff": LimitBackoff(-1.0, 1.0)},
+            "theta has temperature_backoff, allowed is one of each limit that the controller's model predicts",
         ),
-        (CELL, {"ratios": (ResistanceRatio("R2"),)}, "ratios = ['R2'], allowed is each resistance once, of R0, R1"),
-        (CELL, {"voltage_spread": MeasurementSpread()}, "without kalman"),
+        (CELL, {"R2": ResistanceRatio()}, "theta has ratios of R2, allowed are those of this cell: R0, R1"),
+        (CELL, {"voltage_sd": MeasurementSpread()}, "without estimator.kalman"),
     ],
 )
 def test_a_bad_problem_is_refused_by_name(cell, changes, said):
     with pytest.raises(ValueError, match=r"allowed|cannot|without") as caught:
-        ChargingProblem(cell, **changes)
+        charging_problem(cell, **changes)
     assert said in str(caught.value)
 
 
@@ -178,15 +177,14 @@ def test_a_bad_problem_is_refused_by_name(cell, changes, said):
     ("make", "said"),
     [
         (lambda: Limit("voltage", 4.2, 0.0), "name = 'voltage'"),
-        (lambda: LimitBackoff("voltage", 0.0, 1.0), "of = 'voltage'"),
-        (lambda: LimitBackoff("anode", -5.0, 1.0), "lower = -5.0"),
+        (lambda: Tunables(anode_backoff=LimitBackoff(-5.0, 1.0)), "anode_backoff: lower = -5.0"),
         (lambda: CurrentLimit(nodes=1), "nodes = 1"),
         (lambda: CurrentLimit(lower=1.0), "lower = 1.0"),
         (lambda: MeasurementSpread(lower_V=0.0), "lower_V = 0.0"),
-        (lambda: MeasurementSpread(default_V=5.0), "default_V = 5.0"),
+        (lambda: charging_problem(CELL, kalman=Kalman(voltage_sd_V=5.0), voltage_sd=MeasurementSpread()), "voltage_sd_V = 5.0"),
         (lambda: Kalman(voltage_sd_V=0.0), "voltage_sd_V = 0.0"),
         (lambda: Kalman(soc_start_sd=-1.0), "soc_start_sd = -1.0"),
-        (lambda: ResistanceRatio("R0", scale=1), "scale = 1"),
+        (lambda: ResistanceRatio(scale=1), "scale = 1"),
     ],
 )
 def test_nonsense_is_refused_by_name(make, said):
@@ -233,7 +231,7 @@ def test_the_file_says_all_of_it_and_the_store_gives_it_back(tmp_path):
     (tmp_path / "study.toml").write_text(FILE)
     config = load_config(tmp_path / "study.toml")
     problem = config.problem(tmp_path)
-    assert [(limit.name, limit.kind) for limit in problem.limits] == [
+    assert [(limit.name, limit.kind) for limit in problem.limits_by_name.values()] == [
         ("voltage_max_V", "soft"),
         ("voltage_min_V", "soft"),
         ("temperature_max_K", "hard"),
@@ -242,9 +240,9 @@ def test_the_file_says_all_of_it_and_the_store_gives_it_back(tmp_path):
     names = ["backoff_V", "R1_scale", "temperature_backoff_K", "current_limit", "voltage_sd_V"]
     assert [p.name for p in problem.space.parameters] == names
     assert problem.space.default[-1] == pytest.approx(0.1)
-    assert (problem.plant_model.model, problem.plant_model.ambient_K) == ("SPM", 290.0)
-    assert problem.backoff == Backoff(nodes=3)
-    assert problem.charge_time_to_soc == 0.8
+    assert (problem.plant.model, problem.plant.ambient_K) == ("SPM", 290.0)
+    assert problem.theta.backoff == Backoff(nodes=3)
+    assert problem.objective.charge_time_to_soc == 0.8
     document = json.loads(json.dumps(config.document(tmp_path)))
     assert problem_of_document(document) == problem
     # Studies that are older than this choice resume.
@@ -254,17 +252,17 @@ def test_the_file_says_all_of_it_and_the_store_gives_it_back(tmp_path):
 
 def test_a_charge_on_an_electrochemical_plant_within_its_limits():
     cell = replace(WARM, capacity_Ah=5.1, current_max_A=10.0)
-    problem = ChargingProblem(
+    problem = charging_problem(
         cell,
         mismatch_seed=None,
-        plant_model=_spm(),
+        plant=_spm(),
         current_max_A=10.0,
         temperature_max_K=318.15,
         anode_min_V=0.0,
         kalman=Kalman(0.2),
         steps=40,
     )
-    score, episode, ending = problem(problem.space.default, 0)
+    score, episode, ending = evaluate(problem, problem.space.default, 0)
     assert ending == "done"
     assert set(score.excess) == {"voltage_max_V", "voltage_min_V", "temperature_max_K", "anode_min_V"}
     assert score.metrics["soc_end"] > 0.1

@@ -3,16 +3,19 @@
 import math
 import pickle
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell, mismatched
-from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
-from chargetune.episode.episode import Ending, Episode
-from chargetune.plants.sensors import Sensors
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import Evaluation, evaluate, outcome, run_charge
+from chargetune.battery.charging.tunables import Backoff, ResistanceRatio
+from chargetune.battery.charging.verdict import charge_time, score_episode
+from chargetune.episode.episode import Ending
+from charging_problems import changed, charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -21,11 +24,11 @@ NAN, INF = math.nan, math.inf
 
 
 def problem(**changes):
-    return ChargingProblem(CELL, **changes)
+    return charging_problem(CELL, **changes)
 
 
 def score_of(p, theta=None, seed=0):
-    score, _, ending = p(p.space.default if theta is None else theta, seed)
+    score, _, ending = evaluate(p, p.space.default if theta is None else theta, seed)
     assert ending == "done"
     return score
 
@@ -49,12 +52,12 @@ def test_the_objective_may_be_the_time_of_charge():
 @pytest.mark.parametrize(("mark", "name"), [(None, "t95"), (0.8, "t80"), (0.85, "t85")])
 def test_the_charging_time_that_is_told_is_the_one_that_is_the_objective(mark, name):
     p = problem(mismatch_seed=None, charge_time_to_soc=mark)
-    _, episode, _ = p(p.space.default, 0)
-    start, end = p.soc_start, episode.signal("soc")[1]
-    crossing = np.interp(mark or 0.95, [start, *end], np.arange(end.size + 1)) * p.sampling_time_s / 60
-    assert p.charge_time(score_of(p)) == (name, pytest.approx(crossing, abs=1e-9))
-    late = replace(p, soc_start=0.05, steps=60)
-    assert late.charge_time(score_of(late)) == (name, None)
+    episode = run_charge(p)
+    start, end = p.episode.soc_start, episode.signal("soc")[1]
+    crossing = np.interp(mark or 0.95, [start, *end], np.arange(end.size + 1)) * p.controller.sampling_time_s / 60
+    assert charge_time(p, score_of(p)) == (name, pytest.approx(crossing, abs=1e-9))
+    late = changed(p, soc_start=0.05, steps=60)
+    assert charge_time(late, score_of(late)) == (name, None)
 
 
 def test_a_charge_that_does_not_get_there_is_worse_the_less_it_charges():
@@ -92,23 +95,23 @@ def test_no_step_of_twenty_mismatches_is_left_unsolved(overpotential):
 
 
 def test_theta_is_backoff_first_then_the_ratios():
-    p = problem(backoff=Backoff(nodes=3), ratios=(ResistanceRatio("R1"), ResistanceRatio("R0", 0.5, 2.0)))
-    expected = [*(f"backoff_V[{i}]" for i in range(3)), *(f"R1_ratio[{i}]" for i in range(9)), *(f"R0_ratio[{i}]" for i in range(9))]
+    p = problem(backoff=Backoff(nodes=3), R1=ResistanceRatio(), R0=ResistanceRatio(0.5, 2.0))
+    expected = [*(f"backoff_V[{i}]" for i in range(3)), *(f"R0_ratio[{i}]" for i in range(9)), *(f"R1_ratio[{i}]" for i in range(9))]
     assert list(p.space.entries) == expected
     np.testing.assert_array_equal(p.space.default, [0.0] * 3 + [1.0] * 18)
-    assert p.space.lower.tolist() == [-0.25] * 3 + [0.1] * 9 + [0.5] * 9
+    assert p.space.lower.tolist() == [-0.25] * 3 + [0.5] * 9 + [0.1] * 9
     # The middle of the logarithm: ratios are as often halved as doubled.
-    np.testing.assert_allclose(p.space.from_unit(np.full(21, 0.5))[12:], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(p.space.from_unit(np.full(21, 0.5))[3:12], 1.0, rtol=1e-12)
 
 
 def test_the_untuned_theta_is_the_untuned_controller():
-    plain = problem(mismatch_seed=3).episode()
-    tuned = problem(mismatch_seed=3, backoff=Backoff(), ratios=(ResistanceRatio("R0"), ResistanceRatio("R1"))).episode()
+    plain = run_charge(problem(mismatch_seed=3))
+    tuned = run_charge(problem(mismatch_seed=3, backoff=Backoff(), R0=ResistanceRatio(), R1=ResistanceRatio()))
     np.testing.assert_allclose(tuned.input, plain.input, rtol=0, atol=2e-4)
 
 
 def test_the_right_ratios_undo_the_mismatch():
-    p = problem(mismatch_seed=2, ratios=(ResistanceRatio("R0", 0.1, 10.0), ResistanceRatio("R1", 0.1, 10.0)))
+    p = problem(mismatch_seed=2, R0=ResistanceRatio(0.1, 10.0), R1=ResistanceRatio(0.1, 10.0))
     wrong = mismatched(CELL, 2)
     right = np.concatenate([np.array(CELL.R0_ohm) / wrong.R0_ohm, np.array(CELL.R1_ohm) / wrong.R1_ohm])
     # C1 stays wrong, so a little is left.
@@ -124,24 +127,24 @@ def test_a_backoff_of_50_mV_keeps_50_mV():
 
 def test_backoff_at_the_predicted_soc_differs_from_the_measured_one():
     theta = np.linspace(0.1, -0.1, 7)
-    measured, predicted = (problem(mismatch_seed=1, backoff=Backoff(at=at)).episode(theta).input for at in ("measured", "predicted"))
+    measured, predicted = (run_charge(problem(mismatch_seed=1, backoff=Backoff(at=at)), theta).input for at in ("measured", "predicted"))
     difference = np.max(np.abs(measured - predicted))
     assert 1e-3 < difference < 1.0
     flat = np.full(7, 0.03)
-    same = [problem(mismatch_seed=1, backoff=Backoff(at=at)).episode(flat).input for at in ("measured", "predicted")]
+    same = [run_charge(problem(mismatch_seed=1, backoff=Backoff(at=at)), flat).input for at in ("measured", "predicted")]
     np.testing.assert_allclose(*same, rtol=0, atol=6e-4)
 
 
 def test_lower_current_limit_and_own_limits_are_kept():
     p = problem(mismatch_seed=0, current_max_A=4.0, current_min_A=0.5, voltage_max_V=4.1)
-    episode = p.episode()
+    episode = run_charge(p)
     assert 0.5 <= episode.input.min() < episode.input.max() <= 4.0
-    assert p.score(episode).excess["voltage_max_V"] == pytest.approx(np.max(episode.signal("voltage_V")) - 4.1)
+    assert score_episode(p, episode).excess["voltage_max_V"] == pytest.approx(np.max(episode.signal("voltage_V")) - 4.1)
 
 
 def test_score_by_hand(by_hand):
     p = problem(mismatch_seed=None, soc_start=0.7, soc_target=1.0, c1=0.01, voltage_min_V=4.0, tolerance_V=0.01, soc_windows=10)
-    score = p.score(by_hand)
+    score = score_episode(p, by_hand)
     # SOC 0.70, 0.75, 0.85, 0.90, 0.98; the larger voltages 4.21, 4.24, 4.15, 4.205.
     deficit = 0.30**2 + 0.25**2 + 0.15**2 + 0.10**2 + 0.02**2
     assert score.objective == pytest.approx(-deficit / 5)
@@ -168,22 +171,15 @@ def test_no_score_from_a_missing_measurement(by_hand, field, value):
     broken = getattr(by_hand, field).copy()
     broken[2, 0] = value
     with pytest.raises(ValueError, match="no score: a measurement of voltage_V, soc is missing or not finite"):
-        problem(soc_start=0.7).score(replace(by_hand, **{field: broken}))
+        score_episode(problem(soc_start=0.7), replace(by_hand, **{field: broken}))
 
 
 def test_no_score_from_an_episode_without_intervals(by_hand):
     with pytest.raises(ValueError, match="no score"):
-        problem(soc_start=0.7).score(by_hand.cut(0, Ending.DONE, ""))
+        score_episode(problem(soc_start=0.7), by_hand.cut(0, Ending.DONE, ""))
 
 
 def test_a_call_without_score_keeps_the_episode(by_hand):
-    @dataclass
-    class Recorded:
-        episode: Episode
-
-        def run(self, theta, seed, trips):
-            return self.episode
-
     broken = by_hand.output_end.copy()
     broken[2, 0] = NAN
     p = problem(soc_start=0.7)
@@ -191,39 +187,38 @@ def test_a_call_without_score_keeps_the_episode(by_hand):
         (replace(by_hand, output_end=broken), "sensor: the episode has no score: a measurement of voltage_V, soc is missing or not finite"),
         (by_hand.cut(2, Ending.SOLVER, "no input"), "solver: no input"),
     ):
-        p.__dict__["_episodes"] = Recorded(episode)
-        assert p(p.space.default, 0) == (None, episode, said)
+        assert outcome(p, episode) == (None, episode, said)
 
 
 def test_noise_comes_from_the_seed_alone():
-    p = problem(steps=30, sensors=Sensors(noise_sd={"voltage_V": 2e-3, "soc": 1e-3}))
-    one, again, other = (p.episode(seed=s) for s in (1, 1, 2))
+    p = problem(steps=30, voltage_noise_sd_V=2e-3, soc_noise_sd=1e-3)
+    one, again, other = (run_charge(p, seed=s) for s in (1, 1, 2))
     np.testing.assert_array_equal(one.output_end, again.output_end)
     assert not np.array_equal(one.output_end, other.output_end)
 
 
-TUNED = {"mismatch_seed": 3, "backoff": Backoff(), "ratios": (ResistanceRatio("R1"),), "steps": 60}
+TUNED = {"mismatch_seed": 3, "backoff": Backoff(), "R1": ResistanceRatio(), "steps": 60}
 
 
 def test_it_pickles_small_also_after_use():
     p = problem(**TUNED)
-    p.episode()
-    assert p.controller is p.controller
+    run_charge(p)
+    assert controller_of(p) is controller_of(p)
     data = pickle.dumps(p)
     assert len(data) < 5_000
     again = pickle.loads(data)  # noqa: S301 - made two lines above
     assert again == p
-    np.testing.assert_array_equal(again.episode().input, p.episode().input)
+    np.testing.assert_array_equal(run_charge(again).input, run_charge(p).input)
 
 
 def test_a_worker_gives_the_same_score_to_the_last_bit():
     p = problem(**TUNED)
     thetas = [p.space.default, p.space.from_unit(np.full(16, 0.4))]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as workers:
-        futures = [workers.submit(p, theta, 5) for theta in thetas]
+        futures = [workers.submit(Evaluation(p), theta, 5) for theta in thetas]
         for theta, future in zip(thetas, futures, strict=True):
             score, episode, ending = future.result(timeout=120)
-            here = p(theta, 5)
+            here = evaluate(p, theta, 5)
             assert (score, ending) == (here[0], here[2])
             for name, array in here[1].arrays().items():
                 np.testing.assert_array_equal(episode.arrays()[name], array, err_msg=name)
@@ -270,7 +265,6 @@ REFUSED = [
     ({"mismatch_seed": 1.0}, ("mismatch_seed = 1.0", "integer >= 0")),
     ({"mismatch_seed": True}, ("mismatch_seed = True", "integer >= 0")),
     ({"overpotential": "measured"}, ("overpotential = 'measured'", "'model' or 'exact'")),
-    ({"ratios": (ResistanceRatio("R1"), ResistanceRatio("R1", 0.5, 2.0))}, ("ratios = ['R1', 'R1']", "each resistance once")),
     ({"backoff": Backoff(upper_V=0.95), "voltage_max_V": 4.1}, ("upper_V = 0.95 V forbids any charging", "less than 0.923 V")),
 ]
 
@@ -297,13 +291,12 @@ def test_refuses(changes, said):
         (lambda: Backoff(upper_V=200), ("backoff: upper_V = 200", "(0, 1] V")),
         (lambda: Backoff(upper_V="0,2"), ("backoff: upper_V = '0,2'", "(0, 1] V")),
         (lambda: Backoff(at="start"), ("backoff: at = 'start'", "'measured' or 'predicted'")),
-        (lambda: ResistanceRatio("R9"), ("of = 'R9'", "'R0' or 'R1'")),
-        (lambda: ResistanceRatio("R1", lower=0.0), ("resistance ratio of R1: lower = 0.0", "[0.001, 0.999]")),
-        (lambda: ResistanceRatio("R1", lower=1.0), ("resistance ratio of R1: lower = 1.0", "[0.001, 0.999]")),
-        (lambda: ResistanceRatio("R1", lower=-0.1), ("resistance ratio of R1: lower = -0.1", "[0.001, 0.999]")),
-        (lambda: ResistanceRatio("R0", upper=0.9), ("resistance ratio of R0: upper = 0.9", "[1.001, 100]")),
-        (lambda: ResistanceRatio("R0", upper=INF), ("resistance ratio of R0: upper = inf", "[1.001, 100]")),
-        (lambda: ResistanceRatio("R0", upper="6"), ("resistance ratio of R0: upper = '6'", "[1.001, 100]")),
+        (lambda: ResistanceRatio(lower=0.0), ("resistance ratio: lower = 0.0", "[0.001, 0.999]")),
+        (lambda: ResistanceRatio(lower=1.0), ("resistance ratio: lower = 1.0", "[0.001, 0.999]")),
+        (lambda: ResistanceRatio(lower=-0.1), ("resistance ratio: lower = -0.1", "[0.001, 0.999]")),
+        (lambda: ResistanceRatio(upper=0.9), ("resistance ratio: upper = 0.9", "[1.001, 100]")),
+        (lambda: ResistanceRatio(upper=INF), ("resistance ratio: upper = inf", "[1.001, 100]")),
+        (lambda: ResistanceRatio(upper="6"), ("resistance ratio: upper = '6'", "[1.001, 100]")),
     ],
 )
 def test_refuses_a_bad_theta(make, said):
@@ -323,4 +316,4 @@ def test_refuses_a_bad_theta(make, said):
 )
 def test_refuses_theta_outside_its_domain(theta, message):
     with pytest.raises(ValueError, match=message):
-        problem(backoff=Backoff(), steps=60)(theta, 0)
+        evaluate(problem(backoff=Backoff(), steps=60), theta, 0)

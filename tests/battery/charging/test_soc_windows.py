@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
+from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.soc_windows import ChargingWindows, smoothed
+from chargetune.battery.charging.tunables import Backoff, ResistanceRatio
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.studies.open_study import make_tuner
 from chargetune.learning import Composite
-from chargetune.plants.sensors import Sensors
+from charging_problems import changed, charging_problem
 
 NOISE_V = 2e-3
-PROBLEM = ChargingProblem(default_cell(), mismatch_seed=1, charge_time_to_soc=0.95, backoff=Backoff(lower_V=0.0, upper_V=0.2))
-NOISY = replace(PROBLEM, sensors=Sensors(noise_sd={"voltage_V": NOISE_V}), verdict_samples=5)
+PROBLEM = charging_problem(default_cell(), mismatch_seed=1, charge_time_to_soc=0.95, backoff=Backoff(lower_V=0.0, upper_V=0.2))
+NOISY = changed(PROBLEM, voltage_noise_sd_V=NOISE_V, verdict_samples=5)
 
 
 def ends(episode):
@@ -23,25 +25,25 @@ def ends(episode):
 
 @pytest.mark.parametrize("wanted", [0.95, 0.83, 0.5])
 def test_the_time_to_an_soc_is_the_sum_over_the_windows(wanted):
-    windows = ChargingWindows(replace(PROBLEM, charge_time_to_soc=wanted))
-    episode = PROBLEM.episode()
+    windows = ChargingWindows(changed(PROBLEM, charge_time_to_soc=wanted))
+    episode = run_charge(PROBLEM)
     rate, counts = windows.passage(episode).rate, windows.costs > 0
     seconds = np.sum((windows.costs * windows.widths / rate)[counts])
     assert wanted in windows.edges
-    assert -seconds / windows.duration_s == pytest.approx(windows.problem.score(episode).objective, rel=1e-3)
+    assert -seconds / windows.duration_s == pytest.approx(score_episode(windows.problem, episode).objective, rel=1e-3)
 
 
 def test_without_a_wanted_soc_the_windows_give_the_mean_squared_lack_of_charge():
-    problem = replace(PROBLEM, charge_time_to_soc=None)
-    windows, episode = ChargingWindows(problem, windows=50), problem.episode()
+    problem = changed(PROBLEM, charge_time_to_soc=None)
+    windows, episode = ChargingWindows(problem, windows=50), run_charge(problem)
     rate = windows.passage(episode).rate
     done = np.isfinite(rate)
     cost = np.sum((windows.costs * windows.widths / rate)[done]) / windows.duration_s
-    assert -cost == pytest.approx(problem.score(episode).objective, rel=2e-2)
+    assert -cost == pytest.approx(score_episode(problem, episode).objective, rel=2e-2)
 
 
 def test_the_excess_of_a_window_is_the_worst_in_the_trace():
-    windows, episode = ChargingWindows(PROBLEM), PROBLEM.episode()
+    windows, episode = ChargingWindows(PROBLEM), run_charge(PROBLEM)
     passage = windows.passage(episode)
     _, soc = episode.signal("soc")
     worst = ends(episode).max(axis=1) - 4.2
@@ -52,7 +54,7 @@ def test_the_excess_of_a_window_is_the_worst_in_the_trace():
 
 def test_a_charge_that_gets_stuck_leaves_the_last_windows_open():
     windows = ChargingWindows(PROBLEM)
-    episode = PROBLEM.episode(np.full(7, 0.15))
+    episode = run_charge(PROBLEM, np.full(7, 0.15))
     last = episode.signal("soc")[1][-1]
     assert last < 0.9
     passage = windows.passage(episode)
@@ -66,7 +68,7 @@ def test_a_charge_that_gets_stuck_leaves_the_last_windows_open():
 
 
 def test_smoothing_is_a_local_regression_on_time_and_current():
-    episode = NOISY.episode(np.full(7, 0.02), 3)
+    episode = run_charge(NOISY, np.full(7, 0.02), 3)
     _, soc = episode.signal("soc")
     current, k = episode.input[:, 0], 40
     out, factor = smoothed(ends(episode), current, soc)
@@ -82,7 +84,7 @@ def test_smoothing_is_a_local_regression_on_time_and_current():
 
 
 def test_smoothed_noise_is_as_large_as_stated_and_corners_stay_sharp():
-    clean = PROBLEM.episode(np.full(7, 0.04))
+    clean = run_charge(PROBLEM, np.full(7, 0.04))
     _, soc = clean.signal("soc")
     current, draw = clean.input[:, 0], np.random.default_rng(0)
     exact, factor = smoothed(ends(clean), current, soc)
@@ -95,7 +97,7 @@ def test_smoothed_noise_is_as_large_as_stated_and_corners_stay_sharp():
 
 
 def test_a_sample_that_is_missing_is_left_out():
-    episode = NOISY.episode(np.full(7, 0.02), 3)
+    episode = run_charge(NOISY, np.full(7, 0.02), 3)
     start = episode.output_start.copy()
     start[100, episode.output_names.index("voltage_V")] = np.nan
     whole, holed = (ChargingWindows(NOISY).passage(e) for e in (episode, replace(episode, output_start=start)))
@@ -104,7 +106,7 @@ def test_a_sample_that_is_missing_is_left_out():
 
 
 def test_the_tuner_is_made_by_its_name_and_improves_the_charge():
-    problem = replace(NOISY, ratios=(ResistanceRatio("R0", 0.5, 2.0, scale=True),), backoff=None)
+    problem = changed(NOISY, R0=ResistanceRatio(0.5, 2.0, scale=True), backoff=None)
     tuner = make_tuner("composite", 0, problem)
     assert isinstance(tuner, Composite)
     theta = tuner.ask(problem.space, [])

@@ -10,16 +10,17 @@ from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import Backoff, ChargingProblem, ResistanceRatio
-from chargetune.battery.charging.tunables import LimitBackoff
+from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.episode.episode import Ending
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning import Safety, TwinTuner
 from chargetune.learning.twin.ensemble import condition
 from chargetune.learning.twin.laplace import fit
-from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
+from charging_problems import changed, charging_problem
 
 CELL = default_cell()
 
@@ -48,21 +49,18 @@ class AnotherCell:
 
 
 def charge(seed=1, noise=0.002, **changes):
-    sensors = Sensors(noise_sd={"voltage_V": noise}) if noise else Sensors()
-    parts = {"ratios": (ResistanceRatio("R0", 0.1, 4.0),), "charge_time_to_soc": 0.95} | changes
-    return ChargingProblem(
-        CELL if "cell" not in parts else parts.pop("cell"), mismatch_seed=seed, sensors=sensors, verdict_samples=5, **parts
-    )
+    parts = {"cell": CELL, "R0": ResistanceRatio(0.1, 4.0), "charge_time_to_soc": 0.95} | changes
+    return charging_problem(parts.pop("cell"), mismatch_seed=seed, voltage_noise_sd_V=noise, verdict_samples=5, **parts)
 
 
 def learn(problem, tuner, count):
     """(trials, true excess in mV, t95 in min) of ``count`` trials."""
-    exact, trials, excess, minutes = replace(problem, sensors=Sensors()), [], [], []
+    exact, trials, excess, minutes = changed(problem, voltage_noise_sd_V=0.0), [], [], []
     for number in range(count):
         theta = tuner.ask(problem.space, trials)[0]
-        score, episode, _ = problem(theta, number)
+        score, episode, _ = evaluate(problem, theta, number)
         trials.append(SimpleNamespace(number=number, theta=tuple(theta), status="done", score=score, episode=lambda e=episode: e))
-        metrics = exact.score(exact.episode(theta)).metrics
+        metrics = score_episode(exact, run_charge(exact, theta)).metrics
         excess.append(metrics["overshoot_mV"])
         minutes.append(metrics["t95_min"] or np.inf)
     return trials, excess, minutes
@@ -79,7 +77,7 @@ def test_four_trials_and_none_breaks_the_limit():
 
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
-    problem = charge(plant_model=TwoPairs(CELL))
+    problem = charge(plant=TwoPairs(CELL))
     _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
     assert max(excess) <= 5.0
     assert excess[-1] <= 2.0
@@ -95,9 +93,9 @@ def test_temperature_and_anode_potential_are_kept_while_learning():
     )
     believed = replace(true, anode=Anode((0.0, 0.5, 1.0), (0.26, 0.07, 0.05), (0.016, 0.016, 0.02)))
     problem = charge(
-        cell=believed, plant_model=AnotherCell(true), ratios=(), backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3),
+        cell=believed, plant=AnotherCell(true), R0=None, backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3),
         temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8,
-        limit_backoffs=(LimitBackoff("temperature", -5.0, 5.0), LimitBackoff("anode", -0.05, 0.05, nodes=4)),
+        temperature_backoff=LimitBackoff(-5.0, 5.0), anode_backoff=LimitBackoff(-0.05, 0.05, nodes=4),
     )  # fmt: skip
     loop = ChargingTwin(problem)
     assert set(loop.twin.noise_sd) == {"voltage_V", "temperature_K", "anode_potential_V"}
@@ -127,15 +125,14 @@ def test_capacity_start_and_a_constant_error_of_the_voltage_come_back():
 def test_the_controller_reads_what_the_twin_cannot_represent():
     """A cell that is half a kelvin warmer than its model, held at a limit of temperature, against a sensor that is off by as much."""
     warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.05, activation_J_mol=15e3))
-    problem = ChargingProblem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, ratios=(ResistanceRatio("R0"),))
+    problem = charging_problem(warm, mismatch_seed=1, steps=120, temperature_max_K=305.0, R0=ResistanceRatio())
     loop = ChargingTwin(problem)
     table = LookupTable.over(loop.features, list(loop.twin.noise_sd))
     warmer = SimpleNamespace(table=np.tile([[0.5 if name == "temperature_K" else 0.0] for name in table.outputs], table.size))
     theta = problem.space.default
     predicted, without = loop.simulate([(theta, np.zeros(27), warmer), (theta, np.zeros(27), None)])
     # The circuit of the twin is the controller's own: the plant without a mismatch.
-    biased = replace(problem, plant_model=AnotherCell(problem.controller_cell), sensors=Sensors(bias={"temperature_K": 0.5}))
-    measured = biased.episode(theta)
+    measured = run_charge(changed(problem, plant=AnotherCell(problem.controller_cell), temperature_bias_K=0.5), theta)
     for name in ("temperature_K", "voltage_V"):
         np.testing.assert_allclose(predicted.signal(name)[1], measured.signal(name)[1], rtol=0, atol=1e-6)
     assert np.max(measured.signal("temperature_K")[1]) == pytest.approx(305.0, abs=0.1)
@@ -145,7 +142,7 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
 @pytest.mark.usefixtures("virtual_machine")
 def test_only_what_was_not_measured_has_no_verdict():
     problem = charge(steps=120)
-    loop, episode = ChargingTwin(problem), problem.episode(problem.space.default, 0)
+    loop, episode = ChargingTwin(problem), run_charge(problem, problem.space.default, 0)
     holed = replace(episode, output_end=np.full_like(episode.output_end, np.nan))
     assert loop.score(holed) is None
     with pytest.raises(ValueError, match="unknown output"):
@@ -154,7 +151,7 @@ def test_only_what_was_not_measured_has_no_verdict():
 
 def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
     problem = charge(noise=0.0, abort_margin_V=0.02)
-    score, episode, ending = problem(problem.space.default, 0)
+    score, episode, ending = evaluate(problem, problem.space.default, 0)
     start, end = episode.signal("voltage_V")
     assert score is None
     assert episode.ending is Ending.LIMIT
@@ -163,15 +160,15 @@ def test_an_episode_is_ended_once_it_is_too_far_beyond_the_limit():
     # It is learnt from like any other trace.
     trial = SimpleNamespace(number=0, theta=tuple(problem.space.default), status="failed", score=None, episode=lambda: episode)
     assert condition(ChargingTwin(problem), [trial]).discrepancy is not None
-    whole = replace(problem, abort_margin_V=None).episode()
+    whole = run_charge(changed(problem, abort_margin_V=None))
     assert len(episode) < len(whole)
     np.testing.assert_array_equal(episode.input, whole.input[: len(episode)])
 
 
 def test_violation_is_what_is_beyond_the_tolerance_over_time():
     problem = charge(noise=0.0)
-    _, episode, _ = problem(problem.space.default, 0)
-    beyond = np.maximum(*episode.signal("voltage_V")) - problem.voltage_max_V - problem.tolerance_V
+    _, episode, _ = evaluate(problem, problem.space.default, 0)
+    beyond = np.maximum(*episode.signal("voltage_V")) - problem.voltage_max_V - problem.limits.tolerance_V
     assert ChargingTwin(problem).violation(episode) == pytest.approx(1e3 * 10.0 * np.sum(np.maximum(beyond, 0.0)))
 
 

@@ -11,7 +11,8 @@ from chargetune.battery.cell.cell import default_cell, load_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.identification.cycler_files import read_record
 from chargetune.battery.identification.pulse_fit import cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.pulses import find_pulse_sets, groups, segments
@@ -20,6 +21,7 @@ from chargetune.battery.identification.thermal import activation_energy, with_th
 from chargetune.battery.identification.virtual_bench import pulse_test, record_csv, slow_cycle
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.plants.simulated import SimulatedPlant
+from charging_problems import charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -169,8 +171,8 @@ def test_real_pulses(rc, allowed_mV, shared):
     assert found.seconds < 10
     assert not any("the pulses reach" in remark for remark in found.remarks)
     # A controller takes the cell as it is, and charges with it.
-    problem = ChargingProblem(found.cell, mismatch_seed=None, current_max_A=30.0, steps=30)
-    assert problem.score(problem.episode()).metrics["soc_end"] > 0.05
+    problem = charging_problem(found.cell, mismatch_seed=None, current_max_A=30.0, steps=30)
+    assert score_episode(problem, run_charge(problem)).metrics["soc_end"] > 0.05
 
 
 def test_the_identified_cell_predicts_measured_discharges(shared):

@@ -11,11 +11,12 @@ import pytest
 from bpx_cell import CELL
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.evaluate import evaluate
 from chargetune.battery.plants.electrochemical import CellState, Electrochemical, _built, _signals_after
 from chargetune.episode.episode import Ending
 from chargetune.plants.plant import PlantError
 from chargetune.plants.sensors import Sensors
+from charging_problems import charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -130,10 +131,10 @@ def test_beyond_its_range_the_model_ends_with_a_reason(current, intervals, said)
 
 def test_an_episode_ends_with_the_plants_reason_and_is_kept():
     cell = replace(default_cell(), capacity_Ah=5.1, current_max_A=100.0)
-    problem = ChargingProblem(
-        cell, mismatch_seed=None, plant_model=SPM, current_max_A=100.0, current_min_A=50.0, soc_start=0.6, steps=200, voltage_max_V=4.2
+    problem = charging_problem(
+        cell, mismatch_seed=None, plant=SPM, current_max_A=100.0, current_min_A=50.0, soc_start=0.6, steps=200, voltage_max_V=4.2
     )
-    score, episode, ending = problem(problem.space.default, 0)
+    score, episode, ending = evaluate(problem, problem.space.default, 0)
     assert score is None
     assert episode.ending is Ending.PLANT
     assert 0 < len(episode) < 200

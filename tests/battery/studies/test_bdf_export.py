@@ -7,6 +7,7 @@ import pandas as pd
 import psycopg
 import pytest
 
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.identification.cycler_files import read_record
 from chargetune.battery.studies.bdf_export import bdf_columns, export
 from chargetune.battery.studies.open_study import open_study
@@ -30,7 +31,7 @@ def store(request, tmp_path_factory):
     config = load_config(folder / "s.toml")
     with Store(folder / "s.db") as opened:
         with open_study(opened, config) as study:
-            study.run(config.problem(), 3)
+            study.run(Evaluation(config.problem()), 3)
             failed, _ = study.ask(2)
             study.fail(failed.number, 'PlantError: cable, "off"\n')
         if request.param == "sqlite":
@@ -111,7 +112,7 @@ def test_what_cannot_be_a_table_is_named_and_the_rest_written(tmp_path):
     (tmp_path / "s.toml").write_text(QUICK)
     config = load_config(tmp_path / "s.toml")
     with Store(tmp_path / "s.db") as store, open_study(store, config) as study:
-        study.run(config.problem(), 2)
+        study.run(Evaluation(config.problem()), 2)
         (own,) = study.ask()
         study.finish(own.number, None, encode({"x": np.arange(3.0)}, {}), "a trace of the caller's own")
         with store._engine.execution_options(writing=True).begin() as connection:

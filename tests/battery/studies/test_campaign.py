@@ -4,6 +4,7 @@ from contextlib import suppress
 
 import pytest
 
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.studies.campaign import load_campaign, run_campaign
 from chargetune.battery.studies.open_study import open_study
 from chargetune.study.executors import process_executor
@@ -43,7 +44,7 @@ def one_by_one(path, entries):
     with Store(path) as store:
         for entry in entries:
             with open_study(store, entry.config, entry.folder) as study:
-                study.run(entry.config.problem(entry.folder), entry.config.study.trials)
+                study.run(Evaluation(entry.config.problem(entry.folder)), entry.config.study.trials)
     return essence(path)
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import load_config
 from chargetune.study.store.store import Store
@@ -24,7 +25,7 @@ def test_a_study_file_names_earlier_studies(tmp_path):
     for name in ("old", "new"):
         config = load_config(tmp_path / f"{name}.toml")
         with Store(tmp_path / f"{name}.sqlite") as store, open_study(store, config, tmp_path) as study:
-            study.run(config.problem(tmp_path), 3)
+            study.run(Evaluation(config.problem(tmp_path)), 3)
     with Store(tmp_path / "old.sqlite") as old, Store(tmp_path / "new.sqlite") as new:
         before, taken, own = old.trials(1), new.earlier(1), new.trials(1)
         assert [(t.theta, t.score, t.trace_sha256) for t in taken] == [(t.theta, t.score, t.trace_sha256) for t in before]
@@ -45,7 +46,7 @@ def test_a_url_is_no_path(tmp_path):
         ('[[study.earlier]]\nstore = "a"', "study.earlier.0.study"),
         ('[[study.earlier]]\nstore = ""\nstudy = "x"', "study.earlier.0.store = ''"),
         ('[[study.earlier]]\nstore = "a"\nstudy = "x"\ntrials = 3', "study.earlier.0.trials is not a known key"),
-        ('[study.earlier]\nstore = "a"\nstudy = "x"', "study.earlier = .* valid list"),
+        ('[study.earlier]\nstore = "a"\nstudy = "x"', "study.earlier = .* valid array"),
     ],
 )
 def test_bad_tables_are_refused_by_name(tmp_path, table, message):

@@ -6,10 +6,12 @@ import pytest
 from report_studies import legend, lines, segments
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model
+from chargetune.battery.charging.tunables import Tunables
 from chargetune.model.splines import natural_spline
 from chargetune.report import read_study
 from chargetune.report.figures.style import BLUE, GREEN, ORANGE
 from chargetune.report.figures.tuned_curves import SOC, backoff_figure, backoff_values, resistance_figure, resistance_values, violated_soc
+from charging_problems import changed
 
 
 def model_resistances(cell, soc):
@@ -25,7 +27,7 @@ def model_resistances(cell, soc):
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_resistance_is_what_the_circuit_model_uses(stores, seed):
-    problem = replace(read_study(stores["mixed"], "charge").problem, mismatch_seed=seed)
+    problem = changed(read_study(stores["mixed"], "charge").problem, mismatch_seed=seed)
     cell, soc = problem.controller_cell, np.linspace(0.0, 1.0, 41)
     ratio = np.random.default_rng(seed).uniform(0.1, 6.0, 9)
     tuned = replace(cell, R0_ohm=ratio * cell.R0_ohm, R1_ohm=ratio[::-1] * cell.R1_ohm)
@@ -35,7 +37,7 @@ def test_resistance_is_what_the_circuit_model_uses(stores, seed):
 
 
 def test_backoff_is_what_the_controller_uses(stores):
-    backoff = read_study(stores["mixed"], "charge").problem.backoff
+    backoff = read_study(stores["mixed"], "charge").problem.theta.backoff
     nodes = np.array([0.02, 0.0, 0.15, -0.2, 0.05])
     spline = [float(ca.DM(ca.evalf(natural_spline(ca.SX(z), backoff.grid, nodes)))) for z in SOC]
     np.testing.assert_allclose(backoff_values(backoff, nodes), spline, atol=1e-12)
@@ -72,7 +74,7 @@ def test_backoff_figure(stores):
     for drawn, trial in zip(grey, view.others, strict=True):
         np.testing.assert_allclose(drawn[::50, 1], 1e3 * np.array(trial.theta[:5]), atol=1e-9)
     (ocv,) = beside.lines
-    cell = view.problem.plant_cell
+    cell = view.problem.cell
     np.testing.assert_allclose(np.interp(100 * np.array(cell.ocv_soc), *ocv.get_data()), cell.ocv_V, atol=0.03)
     assert ocv.get_ydata()[0] == cell.ocv_V[0]
     assert ocv.get_ydata()[-1] == cell.ocv_V[-1]
@@ -86,7 +88,7 @@ def test_resistance_figure(stores, of, first):
     figure = resistance_figure(view, of)
     (axis,) = figure.axes
     own = 1e3 * np.array(getattr(view.problem.controller_cell, f"{of}_ohm"))
-    true = 1e3 * np.array(getattr(view.problem.plant_cell, f"{of}_ohm"))
+    true = 1e3 * np.array(getattr(view.problem.cell, f"{of}_ohm"))
     assert axis.get_ylabel() == f"$R_{of[1]}$ (mΩ)"
     for color, values in ((GREEN, true), (BLUE, own), (ORANGE, own * view.tuned.theta[first : first + 9])):
         curve, nodes = lines(axis, color)
@@ -123,7 +125,7 @@ def test_a_violating_result_is_called_so(stores):
 
 def test_what_is_not_tuned_is_refused(stores):
     view = read_study(stores["mixed"], "charge")
-    without = replace(view, problem=replace(view.problem, backoff=None, ratios=()))
+    without = replace(view, problem=replace(view.problem, theta=Tunables()))
     with pytest.raises(ValueError, match="does not tune a backoff"):
         backoff_figure(without)
     with pytest.raises(ValueError, match="does not tune R1"):
@@ -132,9 +134,9 @@ def test_what_is_not_tuned_is_refused(stores):
 
 def test_a_remark_is_text_and_no_formula(stores):
     view = read_study(stores["mixed"], "charge")
-    cell = replace(view.problem.plant_cell, remark=r"costs $\frac{$")
-    figure = backoff_figure(replace(view, problem=replace(view.problem, plant_cell=cell)))
+    cell = replace(view.problem.cell, remark=r"costs $\frac{$")
+    figure = backoff_figure(replace(view, problem=changed(view.problem, cell=cell)))
     figure.canvas.draw()
     assert r"costs $\frac{$" in figure.get_supxlabel()
     silent = replace(cell, remark="")
-    assert not backoff_figure(replace(view, problem=replace(view.problem, plant_cell=silent))).get_supxlabel()
+    assert not backoff_figure(replace(view, problem=changed(view.problem, cell=silent))).get_supxlabel()

@@ -53,9 +53,9 @@ def test_profiles_pass_through_their_nodes(view):
     np.testing.assert_allclose(found["R1"]["nodes_y"], belief, rtol=1e-4)
     for profile in found.values():
         np.testing.assert_allclose(np.interp(profile["nodes_x"], profile["x"], profile["y"]), profile["nodes_y"], rtol=0.01, atol=0.5)
-    true = 1e3 * np.array(view.problem.plant_cell.R1_ohm)
+    true = 1e3 * np.array(view.problem.cell.R1_ohm)
     beside = found["R1"]["beside"]
-    np.testing.assert_allclose(np.interp(100 * np.array(view.problem.plant_cell.soc), beside["x"], beside["y"]), true, rtol=0.01)
+    np.testing.assert_allclose(np.interp(100 * np.array(view.problem.cell.soc), beside["x"], beside["y"]), true, rtol=0.01)
 
 
 def test_another_system_shows_every_input_and_output():

@@ -10,6 +10,7 @@ from report_studies import other_study
 from chargetune.report import read_study
 from chargetune.report.page.trial_rows import study_head, study_summary, theta_document, trace_csv, trial_rows
 from chargetune.report.study_view import read_studies
+from charging_problems import changed
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +51,9 @@ def test_head_names_limits_and_theta(view):
 
 
 def test_the_loss_is_named_by_what_is_minimised(view):
-    timed = replace(view.problem, charge_time_to_soc=0.8)
-    changed = [view, replace(view, tuner="ei"), replace(view, problem=timed), replace(view, problem=None)]
-    assert [study_head(v)["loss_label"] for v in changed] == ["mean of (z_d - z)²", "-G", "time to 0.8 SOC / duration", "-objective"]
+    timed = changed(view.problem, charge_time_to_soc=0.8)
+    views = [view, replace(view, tuner="ei"), replace(view, problem=timed), replace(view, problem=None)]
+    assert [study_head(v)["loss_label"] for v in views] == ["mean of (z_d - z)²", "-G", "time to 0.8 SOC / duration", "-objective"]
 
 
 def test_summary(stores):

@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
+from chargetune.battery.charging.evaluate import plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.charging.tunables import Backoff, Tunables
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
@@ -54,13 +56,13 @@ class Row:
 
 def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
     """What can be compared on this plant, in the order of the table."""
-    largest = problem.current_max_A or 0.0
+    largest = problem.current_max_A
     names = [f"CC-CV {share * largest:.3g} A" for share in CCCV_SHARES]
     names += ["multi-step CC", "four-step CC (Attia)", "plant oracle"]
-    if as_steppable(problem.plant) is None:
+    if as_steppable(plant_of(problem)) is None:
         names = []
     names += ["nominal MPC", "best constant backoff"]
-    if problem.plant_model is None:
+    if problem.plant is None:
         names.append("MPC with the true model")
     return [*names, *(["tuned"] if theta is not None else [])]
 
@@ -82,57 +84,58 @@ def compare(
 
 
 def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, seed: int) -> Row:
-    largest = problem.current_max_A or 0.0
-    voltage = problem.limits[:1]
+    largest = problem.current_max_A
+    voltage = [problem.limits_by_name["voltage_max_V"]]
     if name.startswith("CC-CV"):
         share = CCCV_SHARES[row_names(problem, theta).index(name)]
         return _stepped(problem, name, constant_current(share * largest), voltage)
-    plain = replace(problem, backoff=None, ratios=(), limit_backoffs=(), current_limit=None, voltage_spread=None)
+    plain = replace(problem, theta=Tunables())
+    true = replace(plain, controller=replace(plain.controller, mismatch_seed=None))
     table: dict[str, Callable[[], Row]] = {
         "multi-step CC": lambda: _stepped(problem, name, multi_step([s * largest for s in STEP_SHARES]), voltage),
         "four-step CC (Attia)": lambda: _stepped(
-            problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.plant_cell.capacity_Ah)), voltage
+            problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.cell.capacity_Ah)), voltage
         ),
-        "plant oracle": lambda: _stepped(problem, name, constant_current(largest), problem.limits),
-        "nominal MPC": lambda: _judged(problem, name, problem.episode(problem.space.default, seed)),
+        "plant oracle": lambda: _stepped(problem, name, constant_current(largest), list(problem.limits_by_name.values())),
+        "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
-        "MPC with the true model": lambda: _judged(plain, name, replace(plain, mismatch_seed=None).episode(None, seed)),
-        "tuned": lambda: _judged(problem, name, problem.episode(theta, seed)),
+        "MPC with the true model": lambda: _judged(plain, name, run_charge(true, None, seed)),
+        "tuned": lambda: _judged(problem, name, run_charge(problem, theta, seed)),
     }
     return table[name]()
 
 
 def _stepped(problem: ChargingProblem, name: str, law: CurrentLaw, limits: Sequence[object]) -> Row:
-    stepped = as_steppable(problem.plant)
+    stepped = as_steppable(plant_of(problem))
     if stepped is None:
         raise ValueError(f"{name}: the next interval of this plant cannot be tried")
     episode = charge(
         stepped,
         law,
         limits,  # type: ignore[arg-type]
-        steps=problem.steps,
-        soc_target=problem.soc_target,
-        current_max_A=problem.current_max_A or 0.0,
+        steps=problem.episode.steps,
+        soc_target=problem.episode.soc_target,
+        current_max_A=problem.current_max_A,
     )
     return _judged(problem, name, episode)
 
 
 def _judged(problem: ChargingProblem, name: str, episode: Episode) -> Row:
     true = episode.noise_free()
-    exact = replace(problem, verdict_samples=1)
-    noise = {limit.name: problem.sensors.noise_sd.get(limit.signal, 0.0) for limit in problem.limits}
-    return Row(name, true, exact.score(true) if true.ending is Ending.DONE else None, noise)
+    exact = replace(problem, objective=replace(problem.objective, verdict_samples=1))
+    noise = {limit.name: problem.sensors.noise_sd.get(limit.signal, 0.0) for limit in problem.limits_by_name.values()}
+    return Row(name, true, score_episode(exact, true) if true.ending is Ending.DONE else None, noise)
 
 
 def _best_backoff(plain: ChargingProblem, name: str, seed: int) -> Row:
     """The smallest constant voltage backoff with which no limit is broken, by bisection; the largest when none does it."""
-    cell, highest = plain.plant_cell, plain.voltage_max_V or 0.0
-    room = highest - float(np.interp(plain.soc_start, cell.ocv_soc, cell.ocv_V))
+    cell, highest = plain.cell, plain.voltage_max_V
+    room = highest - float(np.interp(plain.episode.soc_start, cell.ocv_soc, cell.ocv_V))
     largest = min(BACKOFF_MAX_V, 0.9 * room)
-    tuned = replace(plain, backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest))
+    tuned = replace(plain, theta=Tunables(backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest)))
 
     def run(value: float) -> Row:
-        return _judged(plain, name, tuned.episode([value, value], seed))
+        return _judged(plain, name, run_charge(tuned, [value, value], seed))
 
     low, high, best = 0.0, largest, run(largest)
     if best.breaks_limit:

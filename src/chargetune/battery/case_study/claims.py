@@ -94,11 +94,11 @@ def _safe(run: SeedRun) -> bool:
 
 def _backoff_falls(runs: Runs) -> bool:
     run = runs["backoff"]
-    if run.tuned is None or run.problem.backoff is None:
+    if run.tuned is None or run.problem.theta.backoff is None:
         return False
     z = np.linspace(MID_SOC, 1.0, 51)
     values = np.array(run.tuned.theta)[run.problem.space.slices["backoff_V"]]
-    b = natural_spline_values(run.problem.backoff.grid, values, z)
+    b = natural_spline_values(run.problem.theta.backoff.grid, values, z)
     return bool(np.polyfit(z, b, 1)[0] < 0)
 
 
@@ -114,7 +114,7 @@ def _differs_from_true(runs: Runs) -> bool:
     if ratio is None:
         return False
     learned = ratio * np.array(run.problem.controller_cell.R1_ohm)
-    return bool(np.max(np.abs(learned / np.array(run.problem.plant_cell.R1_ohm) - 1)) > SAME_RESISTANCE)
+    return bool(np.max(np.abs(learned / np.array(run.problem.cell.R1_ohm) - 1)) > SAME_RESISTANCE)
 
 
 def _exceeds_where_violating(runs: Runs) -> bool:
@@ -124,11 +124,11 @@ def _exceeds_where_violating(runs: Runs) -> bool:
         return False
     start, end = run.untuned_episode.signal("voltage_V")
     _, soc = run.untuned_episode.signal("soc")
-    limit = run.problem.voltage_max_V or 0.0
+    limit = run.problem.voltage_max_V
     where = soc[np.maximum(start, end) > limit + OVERSHOOT_MV / 1000]
     if not where.size:
         return False
-    cell = run.problem.plant_cell
+    cell = run.problem.cell
     nodes = table_nodes(cell.soc)
     ends = [ratio[0]] * int(cell.soc[0] > 0.0), [ratio[-1]] * int(cell.soc[-1] < 1.0)
     r1 = np.array(run.problem.controller_cell.R1_ohm)

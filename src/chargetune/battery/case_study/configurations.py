@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from chargetune.battery.studies.study_file import (
-    BackoffTable,
-    Config,
-    ControllerTable,
-    RatioTable,
-    StudyTable,
-    ThetaTable,
-    TunerName,
-)
+from chargetune.battery.charging.settings import ControllerSettings
+from chargetune.battery.charging.tunables import Backoff, ResistanceRatio, Tunables
+from chargetune.battery.studies.study_file import Config, StudyTable, TunerName
 
 __all__ = ["case_study"]
 
-CASE_STUDIES: dict[str, ThetaTable] = {
-    "backoff": ThetaTable(backoff=BackoffTable(lower_V=0.0, upper_V=0.2)),
-    "model": ThetaTable(R1=RatioTable()),
-    "both": ThetaTable(backoff=BackoffTable(lower_V=0.0, upper_V=0.2), R1=RatioTable()),
+CASE_STUDIES: dict[str, Tunables] = {
+    "backoff": Tunables(backoff=Backoff(lower_V=0.0, upper_V=0.2)),
+    "model": Tunables(R1=ResistanceRatio()),
+    "both": Tunables(backoff=Backoff(lower_V=0.0, upper_V=0.2), R1=ResistanceRatio()),
 }
 
 
@@ -27,6 +21,6 @@ def case_study(name: str, mismatch_seed: int, tuner: TunerName = "default", seed
         raise ValueError(f"case study {name!r}, allowed are {', '.join(CASE_STUDIES)}")
     return Config(
         study=StudyTable(name=f"{name} seed {mismatch_seed} {tuner}", tuner=tuner, seed=mismatch_seed if seed is None else seed),
-        controller=ControllerTable(mismatch_seed=mismatch_seed),
+        controller=ControllerSettings(mismatch_seed=mismatch_seed),
         theta=CASE_STUDIES[name],
     )

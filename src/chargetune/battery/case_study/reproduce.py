@@ -11,6 +11,7 @@ import numpy as np
 
 from chargetune.battery.case_study.claims import SeedRun, decide
 from chargetune.battery.case_study.configurations import CASE_STUDIES, case_study
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import TunerName, problem_of_document
 from chargetune.episode.episode import Episode
@@ -58,7 +59,7 @@ def reproduce(
 def _run_seed(case: str, seed: int, trials: int, tuner: TunerName, path: Path) -> dict[str, Any]:
     config = case_study(case, seed, tuner)
     with Store(path, busy_timeout_s=60.0) as store, open_study(store, config) as study:
-        study.run(config.problem(), trials)
+        study.run(Evaluation(config.problem()), trials)
     with Store(path, read_only=True) as store:
         return seed_row(case, seed, seed_run(store, config.study.name, trials))
 

@@ -21,6 +21,8 @@ class Anode:
     resistance_ohm: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        for name in ("soc", "potential_V", "resistance_ohm"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if not 2 <= len(self.soc) == len(self.potential_V) == len(self.resistance_ohm):
             counts = f"{len(self.soc)}, {len(self.potential_V)} and {len(self.resistance_ohm)}"
             raise ValueError(f"anode: soc, potential_V and resistance_ohm have {counts} values, allowed are as many, at least 2")

@@ -40,6 +40,8 @@ class Thermal:
     factor: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("factor_K", "factor"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         low, high = TEMPERATURE_RANGE_K
         for name, least, most, unit in (
             ("heat_capacity_J_K", 0.0, 1e6, "J/K"),

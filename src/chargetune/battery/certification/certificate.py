@@ -131,11 +131,11 @@ def write_certificate(
         "versions": versions(),
         "origin": dict(origin),
         "theta": dict(theta),
-        "cell": {"name": problem.plant_cell.name, "remark": problem.plant_cell.remark},
-        "sampling_time_s": problem.sampling_time_s,
-        "steps": problem.steps,
-        "soc_start": problem.soc_start,
-        "soc_target": problem.soc_target,
+        "cell": {"name": problem.cell.name, "remark": problem.cell.remark},
+        "sampling_time_s": problem.controller.sampling_time_s,
+        "steps": problem.episode.steps,
+        "soc_start": problem.episode.soc_start,
+        "soc_target": problem.episode.soc_target,
         "seed": seed,
         "confidence": confidence,
         "spread": asdict(spread),
@@ -143,9 +143,9 @@ def write_certificate(
         "judged": "true outputs, without sensor noise, at both ends of every interval",
         "limits": [
             {"name": limit.name, "signal": limit.signal, "upper": limit.upper, "bound": limit.bound, "tolerance": limit.tolerance}
-            for limit in problem.limits
+            for limit in problem.limits_by_name.values()
         ],
-        "figures": figures(ordered, {limit.name: limit.tolerance for limit in problem.limits}, confidence),
+        "figures": figures(ordered, {limit.name: limit.tolerance for limit in problem.limits_by_name.values()}, confidence),
         "traces": {"file": traces.name, "sha256": digest},
     }
     content = json.dumps(certificate, sort_keys=True, separators=(",", ":"), allow_nan=False)

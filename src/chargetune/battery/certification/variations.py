@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
-from chargetune.battery.charging.problem import ChargingProblem, NotMeasuredError
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.settings import SensorSettings
+from chargetune.battery.charging.verdict import NotMeasuredError, score_episode
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.validation import check_number
 from chargetune.control.control_step import compiled_act
@@ -19,7 +22,6 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model
-from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
 __all__ = ["MEANING", "Draw", "PlantVariation", "Variations"]
@@ -69,14 +71,14 @@ class PlantVariation:
         noise = int(stream.integers(2**53))
         shift, age = stream.uniform(-self.soc_start, self.soc_start), float(stream.uniform())
         factors = {}
-        for name in (*problem.plant_cell.tables, "capacity_Ah"):
+        for name in (*problem.cell.tables, "capacity_Ah"):
             width = self.capacity if name == "capacity_Ah" else self.capacitance if name.startswith("C") else self.resistance
             factors[name] = float(1.0 + stream.uniform(-width, width))
             if name == "capacity_Ah":
                 factors[name] *= 1.0 - self.fade * age
             elif name.startswith("R"):
                 factors[name] *= 1.0 + self.growth * age
-        return Draw(float(np.clip(problem.soc_start + shift, 0.0, problem.soc_target - 0.01)), noise, age, factors)
+        return Draw(float(np.clip(problem.episode.soc_start + shift, 0.0, problem.episode.soc_target - 0.01)), noise, age, factors)
 
 
 @dataclass(frozen=True)
@@ -86,39 +88,40 @@ class Variations:
     problem: ChargingProblem
 
     def __post_init__(self) -> None:
-        other = self.problem.plant_model
+        other = self.problem.plant
         if other is not None and not isinstance(other, Electrochemical):
             raise ValueError(f"plant {other!r}: allowed are the cell's circuit and an electrochemical model")
 
     @cached_property
     def model(self) -> Model:
         """The circuit whose parameters are drawn."""
-        return ecm_model(self.problem.plant_cell, self.problem.sampling_time_s)
+        return ecm_model(self.problem.cell, self.problem.controller.sampling_time_s)
 
     def run(self, draw: Draw, theta: ArrayLike) -> tuple[Score | None, Episode]:
         """One charge on the drawn plant and the verdict on its true outputs; no score when it did not come to its end."""
-        problem, factors, known = self.problem, draw.factors, self.problem.plant_model
+        problem, factors, known, step = self.problem, draw.factors, self.problem.plant, self.problem.controller.sampling_time_s
+        sensors = problem.sensors.sensors()
         # What the controller believes moves along, and is a SOC, however wrong it is.
-        believed = start_state(problem.plant_cell, min(max(draw.soc_start + problem.soc_start_error, 0.0), 1.0))
-        names = problem.controller.model.state_names
-        controller = replace(problem.controller, start=tuple(believed.get(name, 0.0) for name in names))
+        believed = start_state(problem.cell, min(max(draw.soc_start + problem.estimator.soc_start_error, 0.0), 1.0))
+        names = controller_of(problem).model.state_names
+        controller = replace(controller_of(problem), start=tuple(believed.get(name, 0.0) for name in names))
         if isinstance(known, Electrochemical):
             resistance = max(1.0, known.resistance_scale * factors["R0_ohm"])
             other = replace(known, resistance_scale=resistance, capacity_scale=known.capacity_scale * factors["capacity_Ah"])
-            drawn = other.plant(draw.soc_start, problem.sampling_time_s, problem.sensors)
+            drawn = other.plant(draw.soc_start, step, sensors)
             control = compiled_act(controller)
-            episode = run_episode(controller, drawn, steps=problem.steps, theta=theta, seed=draw.seed, control=control)
+            episode = run_episode(controller, drawn, steps=problem.episode.steps, theta=theta, seed=draw.seed, control=control)
         else:
             nominal = dict(self.model.parameters)
             scaled = {name: np.array(nominal[name]) * factor for name, factor in factors.items()}
-            plant = SimulatedPlant(self.model.with_parameters(**scaled), start_state(problem.plant_cell, draw.soc_start), problem.sensors)
-            episode = compiled_episode(controller, plant, problem.steps).run(theta, draw.seed)
+            plant = SimulatedPlant(self.model.with_parameters(**scaled), start_state(problem.cell, draw.soc_start), sensors)
+            episode = compiled_episode(controller, plant, problem.episode.steps).run(theta, draw.seed)
         if episode.ending is not Ending.DONE:
             return None, episode
         # Judged is the problem as it stands: one that began at the drawn SOC may be a problem that nobody may state, a cell at rest
         # above its limit for one, and is an episode all the same.
-        judge = replace(problem, sensors=Sensors(), verdict_samples=1)
+        judge = replace(problem, sensors=SensorSettings(), objective=replace(problem.objective, verdict_samples=1))
         try:
-            return judge.score(episode.noise_free(), soc_start=draw.soc_start), episode
+            return score_episode(judge, episode.noise_free(), soc_start=draw.soc_start), episode
         except NotMeasuredError:
             return None, episode

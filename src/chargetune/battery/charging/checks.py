@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model
+from chargetune.battery.charging.controller import controller_of, filter_settings
+from chargetune.battery.charging.evaluate import evaluate, plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem, stand_in
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.checks.finding import Evidence, Finding
@@ -38,13 +40,13 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
     anyway: longer horizons, and the first intervals of an electrochemical plant.
     """
     circuit = stand_in(problem)
-    controller, plant = circuit.controller, circuit.plant
+    controller, plant = controller_of(circuit), plant_of(circuit)
     signs = {(name, "current_A"): sign for name, sign in SIGNS.items() if name in controller.model.output_names}
-    finer = ecm_model(circuit.plant_cell, circuit.sampling_time_s / FINER, _settings(circuit))
+    finer = ecm_model(circuit.cell, circuit.controller.sampling_time_s / FINER, filter_settings(circuit))
     found = list(
         check_formulation(
             controller,
-            steps=circuit.steps,
+            steps=circuit.episode.steps,
             plant=plant if isinstance(plant, SimulatedPlant) else None,
             signs=signs,
             finer=finer,
@@ -64,35 +66,34 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
     return tuple(sorted(found, key=lambda finding: finding.severity != "error"))
 
 
-def _settings(problem: ChargingProblem) -> dict[str, float]:
-    return {"voltage_sd_V": problem.voltage_spread.default_V} if problem.voltage_spread else {}
-
-
 def _beyond(problem: ChargingProblem, theta: NDArray[np.float64]) -> float:
     """The largest excess less its tolerance, in tolerances; infinite when the charge does not come to its end."""
-    score, _, _ = problem(theta, 0)
+    score, _, _ = evaluate(problem, theta, 0)
     return np.inf if score is None else score.worst
 
 
 def _target(problem: ChargingProblem) -> list[Finding]:
     """Whether the target can be reached at rest within the voltage limit, by the largest current, and by a perfect model."""
-    cell, target, limit = problem.plant_cell, problem.soc_target, problem.voltage_max_V or 0.0
+    cell, target, limit = problem.cell, problem.episode.soc_target, problem.voltage_max_V
     resting = float(np.interp(target, cell.ocv_soc, cell.ocv_V))
-    hours = problem.steps * problem.sampling_time_s / 3600
-    most = problem.soc_start + cell.coulombic_efficiency * (problem.current_max_A or 0.0) * hours / cell.capacity_Ah
+    hours = problem.episode.steps * problem.controller.sampling_time_s / 3600
+    most = problem.episode.soc_start + cell.coulombic_efficiency * problem.current_max_A * hours / cell.capacity_Ah
     settled = float(np.interp(limit, cell.ocv_V, cell.ocv_soc))
-    episode = replace(problem, plant_cell=problem.controller_cell, mismatch_seed=None).episode()
+    known = replace(problem, cell=problem.controller_cell, controller=replace(problem.controller, mismatch_seed=None))
+    episode = run_charge(known)
     soc = episode.signal("soc", true=True)[1]
     reached = float(soc[-1]) if len(soc) and episode.ending is Ending.DONE else np.nan
     numbers = {"soc_target": target, "soc_largest_current": most, "soc_at_rest_at_limit": settled, "soc_perfect_model": reached}
-    evidence = Evidence("time (min)", "SOC", {"perfect model": ((episode.time_s + problem.sampling_time_s) / 60, soc)}, {"target": target})
-    if resting > limit + problem.tolerance_V:
+    evidence = Evidence(
+        "time (min)", "SOC", {"perfect model": ((episode.time_s + problem.controller.sampling_time_s) / 60, soc)}, {"target": target}
+    )
+    if resting > limit + problem.limits.tolerance_V:
         message = f"soc_target = {target:g} cannot be reached: at rest it has {resting:.3f} V, voltage_max_V is {limit:g} V"
         remedy = f"soc_target of at most {settled:.3f}, or a higher voltage_max_V"
     elif most < target - MISSED_SOC:
         message = f"soc_target = {target:g} cannot be reached in {60 * hours:.3g} min: the largest current charges to {most:.3f}"
-        needed = (target - problem.soc_start) * cell.capacity_Ah / cell.coulombic_efficiency / (problem.current_max_A or np.inf) * 3600
-        remedy = f"at least {int(np.ceil(needed / problem.sampling_time_s))} steps, or soc_target of at most {most:.3f}"
+        needed = (target - problem.episode.soc_start) * cell.capacity_Ah / cell.coulombic_efficiency / problem.current_max_A * 3600
+        remedy = f"at least {int(np.ceil(needed / problem.controller.sampling_time_s))} steps, or soc_target of at most {most:.3f}"
     elif not reached >= target - MISSED_SOC:
         message = f"soc_target = {target:g}: a controller that knows the cell only gets to {reached:.3f} in {60 * hours:.3g} min"
         remedy = "more steps, a lower soc_target, or wider limits"
@@ -103,15 +104,15 @@ def _target(problem: ChargingProblem) -> list[Finding]:
 
 def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
     """A resistance of an R-C pair in theta although the overpotential that it predicts is measured."""
-    tuned = [ratio for ratio in problem.ratios if ratio.of != "R0"]
-    if problem.overpotential != "exact" or problem.kalman is not None or not tuned:
+    tuned = {of: ratio for of, ratio in problem.theta.ratios.items() if of != "R0"}
+    if problem.controller.overpotential != "exact" or problem.estimator.kalman is not None or not tuned:
         return []
     out = []
-    for ratio in tuned:
+    for of, ratio in tuned.items():
         ranges, curves = {}, {}
-        part = problem.space.slices[ratio.name]
+        part = problem.space.slices[ratio.name(of)]
         for way in ("exact", "model"):
-            variant = replace(problem, overpotential=way)
+            variant = replace(problem, controller=replace(problem.controller, overpotential=way))
             values = np.linspace(0.0, 1.0, 9)
             units = [variant.space.to_unit(variant.space.default) for _ in values]
             for unit, value in zip(units, values, strict=True):
@@ -125,27 +126,27 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
                 Finding(
                     "no-influence",
                     "warning",
-                    f"{ratio.name} has next to no influence: the overpotential is measured at every step, which replaces what {ratio.of} "
+                    f"{ratio.name(of)} has next to no influence: the overpotential is measured at every step, which replaces what {of} "
                     f"predicts; over its whole range the worst voltage moves by {ranges['exact']:.0f} mV (by "
                     f"{ranges['model']:.0f} mV if the model propagated it)",
                     'overpotential = "model" (an overpotential cannot be measured on a real cell), or tune R0 or a backoff instead',
                     {"range_measured_mV": ranges["exact"], "range_propagated_mV": ranges["model"]},
-                    Evidence(f"factor on {ratio.of}", "worst voltage over the limit (mV)", curves, {"limit": 0.0}),
+                    Evidence(f"factor on {of}", "worst voltage over the limit (mV)", curves, {"limit": 0.0}),
                 )
             )
     return out
 
 
 def _voltage_excess(problem: ChargingProblem, theta: NDArray[np.float64]) -> float:
-    return max(float(np.max(values)) for values in problem.episode(theta).signal("voltage_V", true=True)) - (problem.voltage_max_V or 0.0)
+    return max(float(np.max(values)) for values in run_charge(problem, theta).signal("voltage_V", true=True)) - problem.voltage_max_V
 
 
 def _plant_signs(problem: ChargingProblem) -> list[Finding]:
     """The first intervals of another simulated plant than the circuit; a real one is left alone."""
-    if problem.plant_model is None:
+    if problem.plant is None:
         return []
-    plant = problem.plant
+    plant = plant_of(problem)
     if as_steppable(plant) is None:
         return []
-    run: Episode = run_episode(problem.controller, plant, steps=PROBE_STEPS)
-    return check_response(problem.controller, run)
+    run: Episode = run_episode(controller_of(problem), plant, steps=PROBE_STEPS)
+    return check_response(controller_of(problem), run)

@@ -8,10 +8,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.battery.cell.cell import Cell
+from chargetune.battery.validation import check_number
 from chargetune.episode.episode import Episode
 from chargetune.episode.score_limits import ScoredLimit
 
-__all__ = ["HARD_FACTOR", "Limit"]
+__all__ = ["HARD_FACTOR", "Limit", "LimitSettings"]
 
 # The penalty of a hard limit over that of a soft one: nothing soft is worth a violation of it.
 HARD_FACTOR = 1e3
@@ -93,3 +95,56 @@ class Limit:
             f"{short}_excess_{unit}": float(factor * np.max(over)),
             f"{short}_excess_{unit}s": float(factor * episode.sampling_time_s * np.sum(np.maximum(0.0, over).mean(axis=0))),
         }
+
+
+@dataclass(frozen=True)
+class LimitSettings:
+    """Limits; what is not given comes from the cell, or is no limit.
+
+    Limits that the controller's model predicts are kept by it softly. ``hard`` and ``scored_only`` name those that it keeps at any
+    price, or does not see.
+    """
+
+    current_min_A: float = 0.0
+    current_max_A: float | None = None
+    voltage_min_V: float | None = None
+    voltage_max_V: float | None = None
+    tolerance_V: float = 5e-4
+    temperature_max_K: float | None = None
+    tolerance_K: float = 0.05
+    anode_min_V: float | None = None
+    tolerance_anode_V: float = 5e-4
+    hard: tuple[str, ...] = ()
+    scored_only: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_number("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")
+        if self.temperature_max_K is not None:
+            check_number("temperature_max_K", self.temperature_max_K, 250.0, 400.0, "K (was it given in degC?)")
+        if self.anode_min_V is not None:
+            check_number("anode_min_V", self.anode_min_V, -0.5, 0.5, "V")
+        check_number("tolerance_K", self.tolerance_K, 0.0, 10.0, "K")
+        check_number("tolerance_anode_V", self.tolerance_anode_V, 0.0, 0.1, "V")
+        for label in ("hard", "scored_only"):
+            object.__setattr__(self, label, tuple(getattr(self, label)))
+        names = [name for name in SIGNALS if name.startswith("voltage") or getattr(self, name) is not None]
+        for label in ("hard", "scored_only"):
+            unknown = sorted(set(getattr(self, label)) - set(names))
+            if unknown:
+                raise ValueError(f"{label} names {unknown}, allowed are the limits that are set: {', '.join(names)}")
+
+    def by_name(self, cell: Cell) -> dict[str, Limit]:
+        """Every limit that is set on this cell, in the order of the score."""
+        predicted = {"voltage": True, "temperature": cell.thermal is not None, "anode": cell.anode is not None}
+        tolerance = {"voltage": self.tolerance_V, "temperature": self.tolerance_K, "anode": self.tolerance_anode_V}
+        # The only two limits that a cell has itself.
+        own = {"voltage_max_V": cell.voltage_max_V, "voltage_min_V": cell.voltage_min_V}
+        out = {}
+        for name in SIGNALS:
+            given, what = getattr(self, name), name.split("_", maxsplit=1)[0]
+            bound = own.get(name) if given is None else given
+            unseen = name in self.scored_only or not predicted[what]
+            kind: Kind = "scored" if unseen else "hard" if name in self.hard else "soft"
+            if bound is not None:
+                out[name] = Limit(name, bound, tolerance[what], kind)
+        return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -35,7 +35,8 @@ class ChargingWindows:
     A second costs (z_d - z)^2 with z the window's middle, or with ``charge_time_to_soc`` 1 below it and 0 above.
     """
 
-    problem: ChargingProblem
+    # A study's configuration is this problem already, so its identity does not hold it twice.
+    problem: ChargingProblem = field(metadata={"identity": False})
     windows: int = 20
 
     def __post_init__(self) -> None:
@@ -44,7 +45,7 @@ class ChargingWindows:
     @cached_property
     def edges(self) -> NDArray[np.float64]:
         """SOC at the edges of the windows, from that at the start to 1; the SOC that the time is counted to is one of them."""
-        start, wanted = self.problem.soc_start, self.problem.charge_time_to_soc
+        start, wanted = self.problem.episode.soc_start, self.problem.objective.charge_time_to_soc
         edges = np.linspace(0.0, 1.0, self.windows + 1)
         edges = np.sort(np.concatenate([[start], edges[edges > start], [] if wanted is None else [wanted]]))
         return np.asarray(edges[np.concatenate([[True], np.diff(edges) > TINY])], dtype=np.float64)
@@ -55,26 +56,26 @@ class ChargingWindows:
 
     @property
     def costs(self) -> NDArray[np.float64]:
-        middle, wanted = (self.edges[:-1] + self.edges[1:]) / 2, self.problem.charge_time_to_soc
-        return (self.problem.soc_target - middle) ** 2 if wanted is None else np.where(middle < wanted, 1.0, 0.0)
+        middle, wanted = (self.edges[:-1] + self.edges[1:]) / 2, self.problem.objective.charge_time_to_soc
+        return (self.problem.episode.soc_target - middle) ** 2 if wanted is None else np.where(middle < wanted, 1.0, 0.0)
 
     @property
     def duration_s(self) -> float:
-        return self.problem.steps * self.problem.sampling_time_s
+        return self.problem.episode.steps * self.problem.controller.sampling_time_s
 
     @property
     def tolerances(self) -> NDArray[np.float64]:
-        return np.array([limit.tolerance for limit in self.problem.limits])
+        return np.array([limit.tolerance for limit in self.problem.limits_by_name.values()])
 
     def passage(self, episode: Episode) -> Passage:
         # torch is needed from here on only.
         from chargetune.learning.black_box.composite import Passage
 
         _, soc = episode.signal("soc")
-        passed = np.maximum.accumulate(np.concatenate([[self.problem.soc_start], np.nan_to_num(soc, nan=0.0)]))
+        passed = np.maximum.accumulate(np.concatenate([[self.problem.episode.soc_start], np.nan_to_num(soc, nan=0.0)]))
         index = np.clip(np.searchsorted(self.edges, passed[1:], side="right") - 1, 0, len(self.widths) - 1)
         excess, spread = [], []
-        for limit in self.problem.limits:
+        for limit in self.problem.limits_by_name.values():
             noise = self.problem.sensors.noise_sd.get(limit.signal, 0.0)
             ends = np.stack(episode.signal(limit.signal), axis=1)
             share = np.zeros_like(ends)

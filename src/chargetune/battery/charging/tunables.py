@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import casadi as ca
@@ -11,10 +12,15 @@ from numpy.typing import NDArray
 
 from chargetune.battery.validation import check_count, check_number
 from chargetune.control.controller import Stage
-from chargetune.model.parameter_space import Parameter
+from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.model.splines import natural_spline, piecewise_linear
 
-__all__ = ["Backoff", "CurrentLimit", "LimitBackoff", "MeasurementSpread", "ResistanceRatio"]
+__all__ = ["Backoff", "CurrentLimit", "LimitBackoff", "MeasurementSpread", "ResistanceRatio", "Tunables"]
+
+Resistance = Literal["R0", "R1", "R2", "R3"]
+RESISTANCES: tuple[Resistance, ...] = ("R0", "R1", "R2", "R3")
+# What a margin to a limit beside the voltage's may be at most, and its unit.
+WIDEST = {"temperature": (50.0, "K"), "anode": (0.5, "V")}
 
 
 @dataclass(frozen=True)
@@ -57,29 +63,25 @@ class LimitBackoff:
     One node is a constant margin; more are a natural cubic spline over the measured SOC. Signed like `Backoff`.
     """
 
-    of: Literal["temperature", "anode"]
     lower: float
     upper: float
     nodes: int = 1
 
     def __post_init__(self) -> None:
-        if self.of not in ("temperature", "anode"):
-            raise ValueError(f"limit backoff: of = {self.of!r}, allowed is 'temperature' or 'anode'")
-        widest, unit = (50.0, "K") if self.of == "temperature" else (0.5, "V")
-        check_number(f"{self.of} backoff: lower", self.lower, -widest, 0.0, unit)
-        check_number(f"{self.of} backoff: upper", self.upper, 0.0, widest, unit, open_low=True)
-        check_count(f"{self.of} backoff: nodes", self.nodes, 1, 50)
+        widest = max(most for most, _ in WIDEST.values())
+        check_number("limit backoff: lower", self.lower, -widest, 0.0)
+        check_number("limit backoff: upper", self.upper, 0.0, widest, open_low=True)
+        check_count("limit backoff: nodes", self.nodes, 1, 50)
 
-    @property
-    def name(self) -> str:
-        return f"{self.of}_backoff_{'K' if self.of == 'temperature' else 'V'}"
+    def name(self, of: str) -> str:
+        """Its name in theta as margin to the limit ``of`` temperature or anode."""
+        return f"{of}_backoff_{WIDEST[of][1]}"
 
-    @property
-    def parameter(self) -> Parameter:
-        return Parameter(self.name, self.lower, self.upper, 0.0, unit=self.name[-1], size=self.nodes)
+    def parameter(self, of: str) -> Parameter:
+        return Parameter(self.name(of), self.lower, self.upper, 0.0, unit=WIDEST[of][1], size=self.nodes)
 
-    def margin(self, stage: Stage) -> Any:
-        values = stage.theta[self.name]
+    def margin(self, of: str, stage: Stage) -> Any:
+        values = stage.theta[self.name(of)]
         return values if self.nodes == 1 else natural_spline(stage.now["soc"], np.linspace(0.0, 1.0, self.nodes), values)
 
 
@@ -90,25 +92,22 @@ class ResistanceRatio:
     One factor for each node of the cell's tables, or with ``scale=True`` one for the whole table.
     """
 
-    of: Literal["R0", "R1", "R2", "R3"]
     lower: float = 0.1
     upper: float = 6.0
     scale: bool = False
 
     def __post_init__(self) -> None:
-        if self.of not in ("R0", "R1", "R2", "R3"):
-            raise ValueError(f"resistance ratio: of = {self.of!r}, allowed is 'R0' or 'R1' (or 'R2', 'R3' of a cell that has them)")
-        check_number(f"resistance ratio of {self.of}: lower", self.lower, 0.001, 0.999)
-        check_number(f"resistance ratio of {self.of}: upper", self.upper, 1.001, 100.0)
+        check_number("resistance ratio: lower", self.lower, 0.001, 0.999)
+        check_number("resistance ratio: upper", self.upper, 1.001, 100.0)
         if not isinstance(self.scale, bool):
-            raise ValueError(f"resistance ratio of {self.of}: scale = {self.scale!r}, allowed is true or false")
+            raise ValueError(f"resistance ratio: scale = {self.scale!r}, allowed is true or false")
 
-    @property
-    def name(self) -> str:
-        return f"{self.of}_{'scale' if self.scale else 'ratio'}"
+    def name(self, of: str) -> str:
+        """Its name in theta as factor on the resistance ``of`` R0, R1, R2 or R3."""
+        return f"{of}_{'scale' if self.scale else 'ratio'}"
 
-    def parameter(self, nodes: int) -> Parameter:
-        return Parameter(self.name, self.lower, self.upper, 1.0, scale="log", size=1 if self.scale else nodes)
+    def parameter(self, of: str, nodes: int) -> Parameter:
+        return Parameter(self.name(of), self.lower, self.upper, 1.0, scale="log", size=1 if self.scale else nodes)
 
 
 @dataclass(frozen=True)
@@ -140,17 +139,66 @@ class CurrentLimit:
 
 @dataclass(frozen=True)
 class MeasurementSpread:
-    """theta in the estimator: the standard deviation that the Kalman filter assumes of the measured voltage, log scale."""
+    """theta in the estimator: the standard deviation that the Kalman filter assumes of the measured voltage, log scale.
+
+    Untuned it is the filter's own.
+    """
 
     lower_V: float = 1e-3
     upper_V: float = 0.2
-    default_V: float = 0.05
 
     def __post_init__(self) -> None:
         check_number("voltage spread: lower_V", self.lower_V, 1e-6, 1.0, "V")
         check_number("voltage spread: upper_V", self.upper_V, self.lower_V, 10.0, "V", open_low=True)
-        check_number("voltage spread: default_V", self.default_V, self.lower_V, self.upper_V, "V")
+
+    def parameter(self, default_V: float) -> Parameter:
+        return Parameter("voltage_sd_V", self.lower_V, self.upper_V, default_V, unit="V", scale="log")
+
+
+@dataclass(frozen=True)
+class Tunables:
+    """What theta consists of, each part by its place in the controller, and values for it to simulate with.
+
+    ``R0`` to ``R3`` are resistances of the controller's model; ``values`` are of theta by name, what they do not name is untuned. They
+    are no part of what is tuned, so two that differ in nothing else are equal.
+    """
+
+    backoff: Backoff | None = None
+    R0: ResistanceRatio | None = None
+    R1: ResistanceRatio | None = None
+    R2: ResistanceRatio | None = None
+    R3: ResistanceRatio | None = None
+    current_limit: CurrentLimit | None = None
+    temperature_backoff: LimitBackoff | None = None
+    anode_backoff: LimitBackoff | None = None
+    voltage_sd: MeasurementSpread | None = None
+    values: Mapping[str, float | list[float]] = field(default_factory=dict, compare=False)
+
+    def __post_init__(self) -> None:
+        for of, part in self.limit_backoffs.items():
+            widest, unit = WIDEST[of]
+            check_number(f"{of}_backoff: lower", part.lower, -widest, 0.0, unit)
+            check_number(f"{of}_backoff: upper", part.upper, 0.0, widest, unit, open_low=True)
 
     @property
-    def parameter(self) -> Parameter:
-        return Parameter("voltage_sd_V", self.lower_V, self.upper_V, self.default_V, unit="V", scale="log")
+    def ratios(self) -> dict[Resistance, ResistanceRatio]:
+        """The resistances that are tuned, by name."""
+        return {of: part for of in RESISTANCES if (part := getattr(self, of)) is not None}
+
+    @property
+    def limit_backoffs(self) -> dict[str, LimitBackoff]:
+        """The margins that are tuned beside the voltage's, by what is limited: temperature, anode."""
+        parts = {"temperature": self.temperature_backoff, "anode": self.anode_backoff}
+        return {of: part for of, part in parts.items() if part is not None}
+
+    def space(self, nodes: int, voltage_sd_V: float) -> ParameterSpace:
+        """The space of theta for a cell with so many SOC nodes and a filter that assumes this spread of the voltage."""
+        return ParameterSpace(
+            (
+                *([self.backoff.parameter] if self.backoff else []),
+                *(part.parameter(of, nodes) for of, part in self.ratios.items()),
+                *(part.parameter(of) for of, part in self.limit_backoffs.items()),
+                *([self.current_limit.parameter] if self.current_limit else []),
+                *([self.voltage_sd.parameter(voltage_sd_V)] if self.voltage_sd else []),
+            )
+        )

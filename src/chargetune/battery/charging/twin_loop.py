@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
-from chargetune.battery.charging.problem import ChargingProblem, NotMeasuredError, stand_in
+from chargetune.battery.charging.controller import controller_of, measured_rows, row_tolerances
+from chargetune.battery.charging.problem import ChargingProblem, stand_in
+from chargetune.battery.charging.verdict import NotMeasuredError, charge_samples, score_episode, violation_mVs
 from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
@@ -43,7 +45,8 @@ class ChargingTwin:
     Where that error is stated the OCV is taken as known but for it.
     """
 
-    problem: ChargingProblem
+    # A study's configuration is this problem already, so its identity does not hold it twice.
+    problem: ChargingProblem = field(metadata={"identity": False})
     spread: float = 0.4
     smooth: float = 0.3
     capacity_spread: float = 0.0
@@ -57,9 +60,9 @@ class ChargingTwin:
 
         problem = self.problem
         belief = problem.controller_cell
-        circuit = ecm_model(problem.plant_cell, problem.sampling_time_s)
+        circuit = ecm_model(problem.cell, problem.controller.sampling_time_s)
         model = circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
-        anode = belief.anode is not None and problem.anode_min_V is not None
+        anode = belief.anode is not None and problem.limits.anode_min_V is not None
         names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
         noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
@@ -68,29 +71,29 @@ class ChargingTwin:
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
         error = {name: LEAST_ERROR[name] for name in names}
         # Of the cell's own circuit the OCV is known, and but for an unknown that is its error. Else it was identified, worst near full.
-        at_rest = OCV_SHARE if problem.plant_model and not self.ocv_spread_V else 0.0
-        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.soc_start), error, at_rest)
+        at_rest = OCV_SHARE if problem.plant and not self.ocv_spread_V else 0.0
+        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.episode.soc_start), error, at_rest)
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:
         """What the circuit's error depends on: SOC, current and, where it is measured, temperature."""
         problem = self.problem
-        ranges = {"soc": (0.0, 1.0), "current_A": (problem.current_min_A, problem.current_max_A or 0.0)}
-        thermal = problem.controller_cell.thermal
+        ranges = {"soc": (0.0, 1.0), "current_A": (problem.limits.current_min_A, problem.current_max_A)}
+        thermal = problem.cell.thermal
         if thermal:
-            ranges["temperature_K"] = (thermal.ambient_K, (problem.temperature_max_K or thermal.ambient_K + 30.0) + 5.0)
+            ranges["temperature_K"] = (thermal.ambient_K, (problem.limits.temperature_max_K or thermal.ambient_K + 30.0) + 5.0)
         return ranges
 
     @property
     def controller(self) -> Controller:
-        return self.problem.controller
+        return controller_of(self.problem)
 
     def measured_rows(self, episode: Episode) -> NDArray[np.float64]:
-        return self.problem.measured_rows(episode)
+        return measured_rows(self.problem, episode)
 
     @property
     def row_tolerances(self) -> NDArray[np.float64]:
-        return self.problem.row_tolerances
+        return row_tolerances(self.problem)
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
         """Charges without noise, with the discrepancy of each member added to what is measured and so to what the estimator reads."""
@@ -100,28 +103,29 @@ class ChargingTwin:
     def _simulator(self) -> TwinSimulator:
         from chargetune.learning.twin.simulated_twin import TwinSimulator
 
-        return TwinSimulator(self.controller, self.twin, self.features, self.problem.steps)
+        return TwinSimulator(self.controller, self.twin, self.features, self.problem.episode.steps)
 
     def violation(self, episode: Episode) -> float:
         """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""
-        return self.problem.violation_mVs(episode)
+        return violation_mVs(self.problem, episode)
 
     def score(self, episode: Episode) -> Score | None:
         """The verdict in `WINDOWS` of the SOC; None when a signal is not finite."""
         try:
-            return self._exact.score(episode, metrics=False)
+            return score_episode(self._exact, episode, metrics=False)
         except NotMeasuredError:
             return None
 
     def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
-        return self._exact.samples(episode)
+        return charge_samples(self._exact, episode)
 
     @cached_property
     def _exact(self) -> ChargingProblem:
-        return replace(stand_in(self.problem), soc_windows=WINDOWS)
+        exact = stand_in(self.problem)
+        return replace(exact, objective=replace(exact.objective, soc_windows=WINDOWS))
 
     @property
     def unpredicted(self) -> tuple[str, ...]:
         """Limits of the problem that the circuit does not predict: nothing is known of them before they are tried."""
-        known = {limit.name for limit in self._exact.limits}
-        return tuple(limit.name for limit in self.problem.limits if limit.name not in known)
+        known = {limit.name for limit in self._exact.limits_by_name.values()}
+        return tuple(limit.name for limit in self.problem.limits_by_name.values() if limit.name not in known)

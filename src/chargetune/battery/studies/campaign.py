@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import Config, load_config, read_tables
 from chargetune.study.result import Reason, StudyResult, read_result
@@ -109,8 +107,7 @@ def load_campaign(path: str | Path) -> list[Entry]:
             changes = {"name": f"{stem} seed {seed}", "seed": seed, "trials": table.trials or config.study.trials}
             changed = config.model_copy(update={"study": config.study.model_copy(update=changes)})
             if table.mismatch_from_seed:
-                controller = config.controller.model_copy(update={"mismatch_seed": seed})
-                changed = changed.model_copy(update={"controller": controller})
+                changed = changed.model_copy(update={"controller": replace(config.controller, mismatch_seed=seed)})
             entries.append(Entry(changed, file.parent, name))
         if not entries[-1].config.problem(file.parent).space.dimension:
             raise ValueError(f"{file}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
@@ -188,7 +185,7 @@ def _standing(future: Future[Standing], entry: Entry, kept: str | Path, losses: 
 
 def _turn(entry: Entry, kept: str | Path) -> Standing:
     """Batches of one study for a while, in a worker."""
-    problem = _problem(entry)
+    evaluation = Evaluation(entry.config.problem(entry.folder))
     end = time.monotonic() + TURN_S
     wanted = entry.config.study.trials
     with Store(kept, busy_timeout_s=60.0) as store, open_study(store, entry.config, entry.folder) as study:
@@ -196,7 +193,7 @@ def _turn(entry: Entry, kept: str | Path) -> Standing:
             count = len(study.trials())
             # What a dead process left is told first, then one batch.
             limit = max(count, 1) if study.running() else (count // study.batch + 1) * study.batch
-            study.advance(problem, min(limit, wanted))
+            study.advance(evaluation, min(limit, wanted))
             standing = _count(entry, store, study.record)
             if standing.told >= wanted:
                 # Asking a tuner may take seconds, so it is asked once.
@@ -204,16 +201,6 @@ def _turn(entry: Entry, kept: str | Path) -> Standing:
                 return _count(entry, store, study.record)
             if time.monotonic() > end:
                 return standing
-
-
-@lru_cache(maxsize=64)
-def _built(text: str, folder: Path, _process: int) -> ChargingProblem:
-    return Config.model_validate_json(text).problem(folder)
-
-
-def _problem(entry: Entry) -> ChargingProblem:
-    # A problem keeps its compiled episode; a turn shall not load it anew.
-    return _built(entry.config.model_dump_json(), entry.folder, os.getpid())
 
 
 def _seeds(path: Path, seeds: str | list[int]) -> list[int]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.battery.studies.study_file import Config, SafetyTable, TunerName, TwinTable
+from chargetune.battery.studies.study_file import Config, TunerName, TwinTable
 from chargetune.study.store.store import Store
 from chargetune.study.study import Proposer, Study
 
@@ -22,14 +19,13 @@ def make_tuner(
     name: TunerName,
     seed: int,
     problem: ChargingProblem,
-    safety: SafetyTable | None = None,
-    start: NDArray[np.float64] | None = None,
     unknown: TwinTable | None = None,
 ) -> Proposer:
-    """The tuner that a configuration names; the twin simulates the problem's controller.
+    """The tuner that a configuration names; the twin simulates the problem's controller, and is safe where the problem says how.
 
     Raises ValueError when it is to be safe and cannot.
     """
+    safety = problem.safety
     if safety and name != "twin":
         raise ValueError(f"[safety] is given with tuner = {name!r}, allowed is tuner = 'twin': it alone predicts what it has not tried")
     if unknown and name != "twin":
@@ -50,6 +46,7 @@ def make_tuner(
             f"[safety] is given with the limits {', '.join(twin.unpredicted)}, which the cell's circuit does not predict: "
             "allowed are limits whose table ([thermal], [anode]) the cell file has"
         )
+    start = problem.safe_start
     first = None if start is None else tuple(float(v) for v in start)
     safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
     makers: dict[str, Callable[[int], Proposer]] = {
@@ -76,7 +73,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         config.study.name,
         config=config.document(folder),
         space=problem.space,
-        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.safety, config.safe_start(problem), config.twin),
+        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.twin),
         seed=config.study.seed,
         batch=config.study.batch,
         earlier=config.earlier(folder),

@@ -34,8 +34,8 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
         "current_A": problem.current_max_A,
         "voltage_V": problem.voltage_max_V,
         "near": problem.voltage_max_V,
-        "temperature_K": problem.temperature_max_K,
-        "anode_potential_V": None if problem.anode_min_V is None else 1e3 * problem.anode_min_V,
+        "temperature_K": problem.limits.temperature_max_K,
+        "anode_potential_V": None if problem.limits.anode_min_V is None else 1e3 * problem.limits.anode_min_V,
     }
     with journal_style():
         count = (len(names) + 1) // 2
@@ -62,15 +62,15 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
                 axis.axhline(bound, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, zorder=4)
             axis.set_ylabel(LABELS[name])
             if name == "near":
-                limit = problem.voltage_max_V or 0.0
+                limit = problem.voltage_max_V
                 axis.set_ylim(limit - 0.1, limit + 0.1)
         for axis in axes[max(len(names) - 2, 0) : len(names)]:
             axis.set_xlabel("time (min)")
             axis.tick_params(labelbottom=True)
-        axes[0].set_xlim(0.0, problem.steps * problem.sampling_time_s / 60)
+        axes[0].set_xlim(0.0, problem.episode.steps * problem.controller.sampling_time_s / 60)
         letter(axes[: len(names)])
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.1)
         figure.align_ylabels()
-        cell_note(figure, problem.plant_cell.name, problem.plant_cell.remark)
+        cell_note(figure, problem.cell.name, problem.cell.remark)
     return figure

@@ -128,7 +128,7 @@ def loss_label(view: StudyView) -> str:
         return "-G"
     if view.problem is None:
         return "-objective"
-    mark = view.problem.charge_time_to_soc
+    mark = view.problem.objective.charge_time_to_soc
     return "mean of (z_d - z)²" if mark is None else f"time to {mark:.3g} SOC / duration"
 
 

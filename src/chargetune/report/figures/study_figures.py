@@ -25,12 +25,12 @@ def figures_of(view: StudyView) -> dict[str, Figure]:
     if view.problem is not None:
         if any(t.trace_sha256 is not None for t in view.trials):
             figures["trajectories"] = trajectories_figure(view)
-        if view.problem.backoff is not None:
+        if view.problem.theta.backoff is not None:
             figures["backoff"] = backoff_figure(view)
-        if view.problem.current_limit is not None:
+        if view.problem.theta.current_limit is not None:
             figures["current_limit"] = current_limit_figure(view)
-        for ratio in view.problem.ratios:
-            figures[ratio.of] = resistance_figure(view, ratio.of)
+        for of in view.problem.theta.ratios:
+            figures[of] = resistance_figure(view, of)
     figures["convergence"] = convergence_figure(view)
     return figures
 

@@ -111,13 +111,13 @@ def trajectories_figure(view: StudyView) -> Figure:
         _frame(figure, panels, problem, shown or [c["voltage_V"][1] for c in grey])
         letter(axes[: len(names)])
         legend_above(figure, handles)
-        cell_note(figure, problem.plant_cell.name, problem.plant_cell.remark)
+        cell_note(figure, problem.cell.name, problem.cell.remark)
     return figure
 
 
 def panel_names(problem: ChargingProblem) -> list[str]:
     """The panels of a charge: the same four always, and one for each further signal that is limited."""
-    further = {"temperature_K": problem.temperature_max_K, "anode_potential_V": problem.anode_min_V}
+    further = {"temperature_K": problem.limits.temperature_max_K, "anode_potential_V": problem.limits.anode_min_V}
     return ["soc", "current_A", "voltage_V", "near", *(name for name, limit in further.items() if limit is not None)]
 
 
@@ -127,14 +127,14 @@ def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> list[Line2D]:
         "current_A": problem.current_max_A,
         "voltage_V": problem.voltage_max_V,
         "near": problem.voltage_max_V,
-        "temperature_K": problem.temperature_max_K,
-        "anode_potential_V": None if problem.anode_min_V is None else 1e3 * problem.anode_min_V,
+        "temperature_K": problem.limits.temperature_max_K,
+        "anode_potential_V": None if problem.limits.anode_min_V is None else 1e3 * problem.limits.anode_min_V,
     }
     return [panels[name].axhline(value, **style) for name, value in limits.items() if value is not None and name in panels]
 
 
 def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, voltages: list[NDArray[np.float64]]) -> None:
-    limit = problem.voltage_max_V or 0.0
+    limit = problem.voltage_max_V
     peak = np.nanmax(np.concatenate([[limit], *voltages]))
     # Wild trials leave this panel: it is there to show the runs before and after tuning.
     margin = max(0.02, 1.25 * (peak - limit))
@@ -146,5 +146,5 @@ def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, vo
     for axis in list(panels.values())[-2:]:
         axis.set_xlabel("time (min)")
     figure.align_ylabels()
-    panels["soc"].set_xlim(0.0, problem.steps * problem.sampling_time_s / 60)
+    panels["soc"].set_xlim(0.0, problem.episode.steps * problem.controller.sampling_time_s / 60)
     panels["soc"].set_ylim(0.0, 105.0)

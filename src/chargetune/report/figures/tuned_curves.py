@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from chargetune.battery.cell.cell import Cell
 from chargetune.battery.cell.equivalent_circuit import FLOOR, table_nodes
-from chargetune.battery.charging.problem import Backoff, ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.tunables import Backoff
 from chargetune.report.figures.style import (
     BLUE,
     COLUMN_IN,
@@ -45,7 +46,7 @@ def backoff_values(backoff: Backoff, nodes_V: ArrayLike, soc: ArrayLike = SOC) -
 
 def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
     """R(z) in ohm of the circuit model with these node values: natural cubic spline, constant beyond the nodes, kept positive."""
-    values, own = np.asarray(nodes_ohm, dtype=float), problem.plant_cell.soc
+    values, own = np.asarray(nodes_ohm, dtype=float), problem.cell.soc
     nodes = table_nodes(own)
     spline = CubicSpline(nodes, np.interp(nodes, own, values), bc_type="natural")(soc)
     return np.asarray((spline + np.hypot(spline, FLOOR * values.mean())) / 2)
@@ -53,10 +54,10 @@ def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: Array
 
 def current_limit_values(problem: ChargingProblem, nodes: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
     """The current limit in A with these node values, shares of the largest current: piecewise linear. Raises ValueError without one."""
-    if problem.current_limit is None:
+    if problem.theta.current_limit is None:
         raise ValueError("current_limit is not part of this problem's theta")
-    share = np.interp(np.asarray(soc, dtype=float), problem.current_limit.grid, np.asarray(nodes, dtype=float))
-    return np.asarray((problem.current_max_A or 0.0) * share, dtype=np.float64)
+    share = np.interp(np.asarray(soc, dtype=float), problem.theta.current_limit.grid, np.asarray(nodes, dtype=float))
+    return np.asarray(problem.current_max_A * share, dtype=np.float64)
 
 
 def violated_soc(view: StudyView) -> list[tuple[float, float]]:
@@ -65,7 +66,7 @@ def violated_soc(view: StudyView) -> list[tuple[float, float]]:
     if episode is None or view.problem is None or view.problem.voltage_max_V is None:
         return []
     voltage, soc = np.stack(episode.signal("voltage_V")), np.stack(episode.signal("soc"))
-    over = np.any(voltage > view.problem.voltage_max_V + view.problem.tolerance_V, axis=0)
+    over = np.any(voltage > view.problem.voltage_max_V + view.problem.limits.tolerance_V, axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], over, [False]])))
     return [(float(soc[0, first]), float(soc[1, beyond - 1])) for first, beyond in edges.reshape(-1, 2)]
 
@@ -73,15 +74,15 @@ def violated_soc(view: StudyView) -> list[tuple[float, float]]:
 def backoff_figure(view: StudyView) -> Figure:
     """b(z) of all trials in mV, with the OCV beside it. Raises ValueError when theta has no backoff."""
     problem = view.problem
-    if problem is None or problem.backoff is None:
+    if problem is None or problem.theta.backoff is None:
         raise ValueError(f"study {view.name!r} does not tune a backoff")
-    cell, part = problem.plant_cell, view.space.slices["backoff_V"]
-    grid = problem.backoff.grid
+    cell, part = problem.cell, view.space.slices["backoff_V"]
+    grid = problem.theta.backoff.grid
     with journal_style():
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
         nodes = {label: 1e3 * np.array(theta[part]) for label, theta in _thetas(view).items()}
-        drawn = {label: backoff_values(problem.backoff, values) for label, values in nodes.items()}
-        handles = _grey(axis, [1e3 * backoff_values(problem.backoff, t.theta[part]) for t in view.others])
+        drawn = {label: backoff_values(problem.theta.backoff, values) for label, values in nodes.items()}
+        handles = _grey(axis, [1e3 * backoff_values(problem.theta.backoff, t.theta[part]) for t in view.others])
         for label, color in (("untuned", BLUE), ("tuned", ORANGE)):
             if label in drawn:
                 text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
@@ -89,25 +90,25 @@ def backoff_figure(view: StudyView) -> Figure:
                 axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
         if not np.ptp(list(drawn.values())):
             # b = 0 alone spans no range; that of the trials says what was tried.
-            axis.set_ylim(1e3 * problem.backoff.lower_V - 10, 1e3 * problem.backoff.upper_V + 10)
+            axis.set_ylim(1e3 * problem.theta.backoff.lower_V - 10, 1e3 * problem.theta.backoff.upper_V + 10)
         beside = axis.twinx()
         beside.spines["right"].set_visible(True)
         handles += beside.plot(100 * SOC, PchipInterpolator(cell.ocv_soc, cell.ocv_V)(SOC), color="black", linestyle=":", label="OCV")
         beside.set_ylabel("OCV (V)")
         axis.set_ylabel("backoff $b$ (mV)")
-        _finish(figure, axis, view, problem.plant_cell, handles)
+        _finish(figure, axis, view, problem.cell, handles)
     return figure
 
 
 def resistance_figure(view: StudyView, of: str) -> Figure:
     """A resistance over SOC in milliohm: of plant, untuned and tuned controller. Raises ValueError when theta has none."""
     problem = view.problem
-    ratios = {ratio.of: ratio for ratio in problem.ratios} if problem else {}
-    if problem is None or of not in ratios:
+    ratio = None if problem is None else getattr(problem.theta, of, None)
+    if problem is None or ratio is None:
         raise ValueError(f"study {view.name!r} does not tune {of}")
-    part = view.space.slices[ratios[of].name]
+    part = view.space.slices[ratio.name(of)]
     believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
-    true = np.array(getattr(problem.plant_cell, f"{of}_ohm"))
+    true = np.array(getattr(problem.cell, f"{of}_ohm"))
     with journal_style():
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
         handles = _grey(axis, [1e3 * resistance_values(problem, believed * t.theta[part]) for t in view.others])
@@ -117,19 +118,19 @@ def resistance_figure(view: StudyView, of: str) -> Figure:
                 text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
                 values = 1e3 * resistance_values(problem, nodes[label])
                 handles += axis.plot(100 * SOC, values, color=color, linestyle=dashes, label=text, zorder=3)
-                axis.plot(100 * np.array(problem.plant_cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
+                axis.plot(100 * np.array(problem.cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
         axis.set_ylim(bottom=0.0)
         axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")
-        _finish(figure, axis, view, problem.plant_cell, handles)
+        _finish(figure, axis, view, problem.cell, handles)
     return figure
 
 
 def current_limit_figure(view: StudyView) -> Figure:
     """The current limit over SOC in A of all trials. Raises ValueError when theta has none."""
     problem = view.problem
-    if problem is None or problem.current_limit is None:
+    if problem is None or problem.theta.current_limit is None:
         raise ValueError(f"study {view.name!r} does not tune a current limit")
-    part, largest = view.space.slices["current_limit"], problem.current_max_A or 0.0
+    part, largest = view.space.slices["current_limit"], problem.current_max_A
 
     def values(theta: Any) -> NDArray[np.float64]:
         return current_limit_values(problem, np.array(theta[part]))
@@ -142,7 +143,7 @@ def current_limit_figure(view: StudyView) -> Figure:
             handles += axis.plot(100 * SOC, values(theta), color=color, linestyle=dashes, label=text, zorder=3)
         axis.set_ylim(0.0, 1.05 * largest)
         axis.set_ylabel("current limit (A)")
-        _finish(figure, axis, view, problem.plant_cell, handles)
+        _finish(figure, axis, view, problem.cell, handles)
     return figure
 
 

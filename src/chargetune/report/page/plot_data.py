@@ -42,18 +42,18 @@ def signals(problem: ChargingProblem | None, episode: Episode, points: int = POI
     if problem is None or "soc" not in episode.output_names:
         return [_panel(*entry, points, time="time (s)") for entry in _everything(episode)]
     drawn = curves(episode)
-    anode, highest = problem.anode_min_V, problem.voltage_max_V
-    limits = {
+    anode, highest = problem.limits.anode_min_V, problem.voltage_max_V
+    limits: dict[str, list[float | None]] = {
         "current_A": [problem.current_max_A],
         "voltage_V": [problem.voltage_min_V, highest],
-        "temperature_K": [problem.temperature_max_K],
+        "temperature_K": [problem.limits.temperature_max_K],
         "anode_potential_V": [None if anode is None else 1e3 * anode],
     }
     out = []
     for key, (x, y) in drawn.items():
         known = [value for value in limits.get(key, []) if value is not None]
         out.append(_panel(key, LABELS[key], x, y, points, limits=known))
-        if key == "voltage_V" and highest is not None:
+        if key == "voltage_V":
             shown = [highest - NEAR_V[0], highest + NEAR_V[1]]
             near = _panel("near", LABELS["near"], x[:0], y[:0], points, limits=[highest], shown=shown)
             out.append(near | {"of": key})
@@ -69,28 +69,28 @@ def profiles(view: StudyView, theta: NDArray[np.float64]) -> list[dict[str, Any]
     if problem is None:
         return []
     slices, soc = view.space.slices, 100 * SOC[::2]
-    if problem.backoff is not None:
+    if problem.theta.backoff is not None:
         nodes = theta[slices["backoff_V"]]
-        curve = 1e3 * backoff_values(problem.backoff, nodes)[::2]
-        out.append(_profile("backoff", "backoff b (mV)", soc, curve, 100 * problem.backoff.grid, 1e3 * nodes))
-    for part in problem.limit_backoffs:
-        factor, unit = (1.0, "K") if part.of == "temperature" else (1e3, "mV")
-        nodes, grid = factor * theta[slices[part.name]], np.linspace(0.0, 1.0, part.nodes)
+        curve = 1e3 * backoff_values(problem.theta.backoff, nodes)[::2]
+        out.append(_profile("backoff", "backoff b (mV)", soc, curve, 100 * problem.theta.backoff.grid, 1e3 * nodes))
+    for of, part in problem.theta.limit_backoffs.items():
+        factor, unit = (1.0, "K") if of == "temperature" else (1e3, "mV")
+        nodes, grid = factor * theta[slices[part.name(of)]], np.linspace(0.0, 1.0, part.nodes)
         spline = CubicSpline(grid, nodes, bc_type="natural")(SOC[::2]) if part.nodes > 1 else np.full(SOC[::2].size, nodes[0])
-        out.append(_profile(part.name, f"{part.of} backoff ({unit})", soc, spline, 100 * grid, nodes))
-    if problem.current_limit is not None:
-        largest, grid = problem.current_max_A or 0.0, problem.current_limit.grid
+        out.append(_profile(part.name(of), f"{of} backoff ({unit})", soc, spline, 100 * grid, nodes))
+    if problem.theta.current_limit is not None:
+        largest, grid = problem.current_max_A, problem.theta.current_limit.grid
         nodes = theta[slices["current_limit"]]
         curve = current_limit_values(problem, nodes)[::2]
         out.append(_profile("current_limit", "current limit (A)", soc, curve, 100 * grid, largest * nodes))
-    for ratio in problem.ratios:
-        believed = np.array(getattr(problem.controller_cell, f"{ratio.of}_ohm"))
-        true = np.array(getattr(problem.plant_cell, f"{ratio.of}_ohm"))
-        nodes = 1e3 * believed * theta[slices[ratio.name]]
+    for of, ratio in problem.theta.ratios.items():
+        believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
+        true = np.array(getattr(problem.cell, f"{of}_ohm"))
+        nodes = 1e3 * believed * theta[slices[ratio.name(of)]]
         curve = 1e3 * resistance_values(problem, nodes / 1e3)[::2]
-        entry = _profile(ratio.of, f"{ratio.of} (mΩ)", soc, curve, 100 * np.array(problem.plant_cell.soc), nodes)
+        entry = _profile(of, f"{of} (mΩ)", soc, curve, 100 * np.array(problem.cell.soc), nodes)
         beside = {"label": "plant", "x": rounded(soc), "y": rounded(1e3 * resistance_values(problem, true)[::2])}
-        out.append(entry | ({"beside": beside} if problem.plant_model is None else {}))
+        out.append(entry | ({"beside": beside} if problem.plant is None else {}))
     return out
 
 

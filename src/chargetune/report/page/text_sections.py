@@ -54,23 +54,25 @@ def what_was_tuned(view: StudyView) -> str:
     problem, head = view.problem, study_head(view)
     parts = []
     if problem is not None:
-        plant = "its own circuit, simulated" if problem.plant_model is None else repr(problem.plant_model)
-        belief = "the plant's own" if problem.mismatch_seed is None else f"wrong by the factors of mismatch seed {problem.mismatch_seed}"
+        plant = "its own circuit, simulated" if problem.plant is None else repr(problem.plant)
+        control, charge = problem.controller, problem.episode
+        seed = control.mismatch_seed
+        belief = "the plant's own" if seed is None else f"wrong by the factors of mismatch seed {seed}"
         facts = [
-            ("cell", problem.plant_cell.name),
-            ("capacity", f"{problem.plant_cell.capacity_Ah:g} Ah"),
+            ("cell", problem.cell.name),
+            ("capacity", f"{problem.cell.capacity_Ah:g} Ah"),
             ("plant", plant),
             ("controller's parameters", belief),
-            ("sampling time, horizon", f"{problem.sampling_time_s:g} s, {problem.horizon} intervals"),
+            ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
             (
                 "charge",
-                f"SOC {problem.soc_start:g} to {problem.soc_target:g}, at most {problem.steps * problem.sampling_time_s / 60:g} min",
+                f"SOC {charge.soc_start:g} to {charge.soc_target:g}, at most {charge.steps * control.sampling_time_s / 60:g} min",
             ),
             ("tuner", view.tuner),
         ]
         parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts]))
-        if problem.plant_cell.remark:
-            parts.append(paragraph(f"{problem.plant_cell.name}: {problem.plant_cell.remark}", "faint"))
+        if problem.cell.remark:
+            parts.append(paragraph(f"{problem.cell.name}: {problem.cell.remark}", "faint"))
         rows = [(x["name"], float(x["bound"]), x["unit"], float(x["tolerance"]), x["kind"]) for x in head["limits"]]
         parts.append(table(("limit", "bound", "unit", "tolerance", "in the controller"), rows))
     else:

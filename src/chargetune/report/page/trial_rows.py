@@ -29,8 +29,8 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "name": view.name,
         "created_at": "" if record is None else record.created_at,
         "tuner": view.tuner,
-        "cell": "" if problem is None else problem.plant_cell.name,
-        "remark": "" if problem is None else problem.plant_cell.remark,
+        "cell": "" if problem is None else problem.cell.name,
+        "remark": "" if problem is None else problem.cell.remark,
         "loss_label": loss_label(view),
         "excess_unit": unit,
         "tolerance": scale * allowed.pop() if len(allowed) == 1 and unit in ("mV", "unit of the limit") else None,
@@ -47,12 +47,12 @@ def limits_of(view: StudyView) -> list[dict[str, Any]]:
     problem = view.problem
     if problem is None:
         return []
-    bounds = [("current_min_A", problem.current_min_A), ("current_max_A", problem.current_max_A)]
+    bounds = [("current_min_A", problem.limits.current_min_A), ("current_max_A", problem.current_max_A)]
     inputs = [{"name": n, "bound": b, "unit": "A", "tolerance": 0.0, "kind": "bound of the input"} for n, b in bounds if b is not None]
     kinds = {"soft": "kept by a penalty", "hard": "kept at any price", "scored": "not seen by the controller, scored"}
     outputs = [
         {"name": limit.name, "bound": limit.bound, "unit": limit.unit, "tolerance": limit.tolerance, "kind": kinds[limit.kind]}
-        for limit in problem.limits
+        for limit in problem.limits_by_name.values()
     ]
     return inputs + outputs
 

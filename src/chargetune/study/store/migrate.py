@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Engine, func, insert, select, text
+from sqlalchemy import Connection, Engine, func, insert, select, text, update
 
 from chargetune.study.provenance import made_by, utc_now
 from chargetune.study.serialization import canonical_json, sha256
@@ -73,8 +73,30 @@ def _back_up(path: Path, version: int | None) -> Path:
 
 
 def from_2_to_3(connection: Connection) -> None:
-    """Make the table of results, empty: of an older study the result is what was measured, until its tuner is asked."""
+    """Make the table of results, empty, and bring every identity to what `study_identity` makes today.
+
+    Of an older study the result is what was measured, until its tuner is asked. An identity that is damaged stays as it is.
+    """
     schema.result.create(connection)
+    study = schema.study.c
+    for row in connection.execute(select(study.id, study.identity, study.identity_sha256)).all():
+        if sha256(row.identity) == row.identity_sha256:
+            identity = canonical_json(_identity_3(json.loads(row.identity)), "identity")
+            values = {"identity": identity, "identity_sha256": sha256(identity)}
+            connection.execute(update(schema.study).where(study.id == row.id).values(values))
+
+
+def _identity_3(identity: dict[str, Any]) -> dict[str, Any]:
+    """An identity of schema 2 as schema 3 has it: the tuner without the problem, which its configuration holds, and by today's name."""
+    config, tuner = identity.get("config"), identity.get("tuner")
+    if isinstance(config, dict) and isinstance(config.get("study"), dict) and config["study"].get("tuner") == "envelope":
+        config["study"]["tuner"] = "iterative_learning"
+    if isinstance(tuner, dict):
+        if tuner.get("type") == "Envelope":
+            tuner["type"] = "IterativeLearning"
+        if isinstance(tuner.get("loop"), dict):
+            tuner["loop"].pop("problem", None)
+    return identity
 
 
 def _from_1_to_2(connection: Connection) -> None:

@@ -1,0 +1,159 @@
+"""Settings of a charging problem, one class for each table of a study file: how it is controlled, estimated, measured and judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from chargetune.battery.charging.kalman import Kalman
+from chargetune.battery.validation import check_count, check_number
+from chargetune.plants.sensors import Sensors
+
+__all__ = ["ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """The controller and what it wrongly believes; no ``mismatch_seed`` means that it knows the cell.
+
+    ``overpotential``: "model" propagates the overpotentials by the controller's own model from a measured SOC, "exact" gives it the
+    plant's. ``penalty_per_V`` is the exact penalty of the voltage limits; the other limits' follow from it.
+    """
+
+    sampling_time_s: float = 10.0
+    horizon: int = 5
+    mismatch_seed: int | None = None
+    overpotential: Literal["model", "exact"] = "model"
+    penalty_per_V: float = 1e3
+
+    def __post_init__(self) -> None:
+        check_number("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
+        check_count("horizon", self.horizon, 1, 50)
+        check_number("penalty_per_V", self.penalty_per_V, 0.0, 1e9, "", open_low=True)
+        seed = self.mismatch_seed
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+            raise ValueError(f"mismatch_seed = {seed!r}, allowed is an integer >= 0")
+        if self.overpotential not in ("model", "exact"):
+            raise ValueError(f"overpotential = {self.overpotential!r}, allowed is 'model' or 'exact'")
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """What the controller knows of the state.
+
+    ``soc_start_error`` is what it believes of the SOC at the start less the truth. A ``kalman`` filter estimates SOC and
+    overpotentials from voltage and current instead of a measured SOC.
+    """
+
+    soc_start_error: float = 0.0
+    kalman: Kalman | None = None
+
+    def __post_init__(self) -> None:
+        check_number("soc_start_error", self.soc_start_error, -0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """One charge: its largest number of intervals, and the SOC that it begins at and is to reach."""
+
+    steps: int = 360
+    soc_start: float = 0.05
+    soc_target: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_count("steps", self.steps, 1, 1_000_000)
+        start = check_number("soc_start", self.soc_start, 0.0, 1.0, "")
+        target = check_number("soc_target", self.soc_target, 0.0, 1.0, "")
+        if target <= start:
+            raise ValueError(f"soc_target = {target:g} must be more than soc_start = {start:g}")
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """Imperfect measurement of the plant."""
+
+    voltage_noise_sd_V: float = 0.0
+    voltage_bias_V: float = 0.0
+    voltage_resolution_V: float = 0.0
+    temperature_noise_sd_K: float = 0.0
+    temperature_bias_K: float = 0.0
+    soc_noise_sd: float = 0.0
+    soc_bias: float = 0.0
+    delay_steps: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("voltage_noise_sd_V", "voltage_resolution_V", "temperature_noise_sd_K", "soc_noise_sd"):
+            check_number(name, getattr(self, name), 0.0, math.inf)
+        for name in ("voltage_bias_V", "temperature_bias_K", "soc_bias"):
+            check_number(name, getattr(self, name), -math.inf, math.inf)
+        check_count("delay_steps", self.delay_steps, 0, 100)
+
+    @property
+    def noise_sd(self) -> dict[str, float]:
+        """The standard deviations that are not zero, by signal; a plant need not have the others."""
+        return _given(voltage_V=self.voltage_noise_sd_V, temperature_K=self.temperature_noise_sd_K, soc=self.soc_noise_sd)
+
+    def sensors(self) -> Sensors:
+        """The same by signal, as a plant takes it."""
+        bias = _given(voltage_V=self.voltage_bias_V, temperature_K=self.temperature_bias_K, soc=self.soc_bias)
+        return Sensors(self.noise_sd, bias, {"voltage_V": self.voltage_resolution_V}, self.delay_steps)
+
+
+def _given(**values: float) -> dict[str, float]:
+    return {signal: value for signal, value in values.items() if value}
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a charge is worth, and how closely its limits are looked at.
+
+    c1
+        Weight of the paper's scalar performance G.
+    charge_time_to_soc
+        The SOC to which the time of charge is minimised; None: the mean squared lack of charge is.
+    soc_windows
+        Equal parts of the SOC in each of which the worst excess of a limit is told to the tuner.
+    verdict_samples
+        Intervals of the moving mean by which a noisy signal is judged.
+    """
+
+    c1: float = 1e-5
+    charge_time_to_soc: float | None = None
+    soc_windows: int = 5
+    verdict_samples: int = 1
+
+    def __post_init__(self) -> None:
+        check_number("c1", self.c1, 0.0, 1.0, "", open_low=True)
+        if self.charge_time_to_soc is not None:
+            check_number("charge_time_to_soc", self.charge_time_to_soc, 0.0, 1.0, "", open_low=True)
+        check_count("soc_windows", self.soc_windows, 1, 50)
+        check_count("verdict_samples", self.verdict_samples, 1, 1000)
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """Safe learning by the twin: what must be likely, where to begin, what may be spent, when an episode is ended.
+
+    ``start`` holds values of theta by name; without it the most cautious corner is the start. ``abort_margin_V`` and
+    ``abort_margin_K`` end an episode as soon as a measured voltage or temperature is so far beyond its upper limit: the plant is
+    closed, its current is 0, the trial failed and its trace is kept.
+    """
+
+    probability: float = 0.95
+    start: Mapping[str, float | list[float]] | None = field(default=None, hash=False)
+    budget_mVs: float | None = None
+    abort_margin_V: float | None = 0.02
+    abort_margin_K: float | None = 2.0
+
+    def __post_init__(self) -> None:
+        p = self.probability
+        if isinstance(p, bool) or not isinstance(p, (int, float)) or not 0.5 <= p < 1.0:
+            raise ValueError(f"probability = {p!r}, allowed is [0.5, 1)")
+        if self.budget_mVs is not None:
+            check_number("budget_mVs", self.budget_mVs, 0.0, math.inf, "mV s")
+        if self.abort_margin_V is not None:
+            check_number("abort_margin_V", self.abort_margin_V, 0.0, 1.0, "V", open_low=True)
+        if self.abort_margin_K is not None:
+            check_number("abort_margin_K", self.abort_margin_K, 0.0, 50.0, "K", open_low=True)
