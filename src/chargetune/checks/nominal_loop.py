@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_influence
 from chargetune.checks.static import check_horizon, check_signs, check_start, model_at, noticeable, row_values
-from chargetune.control.controller import Controller, Limit
+from chargetune.control.controller import Controller, LimitRows
 from chargetune.episode.compiled import simulate
 from chargetune.episode.episode import Episode
 from chargetune.model.model import Model
@@ -172,7 +172,7 @@ def _seen(controller: Controller, j: int, run: Episode, theta: ArrayLike | None)
     return np.asarray(np.max(rows, axis=0), dtype=np.float64)
 
 
-def _between(limit: Limit, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float) -> Finding:
+def _between(limit: LimitRows, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float) -> Finding:
     coarse = at_ends <= noticeable(limit)
     return Finding(
         "between-samples",
@@ -226,5 +226,5 @@ def _costs(controller: Controller, run: Episode, theta: ArrayLike | None) -> NDA
     return np.asarray(cost, dtype=np.float64)
 
 
-def _depends_on_input(limit: Limit) -> bool:
+def _depends_on_input(limit: LimitRows) -> bool:
     return bool(limit.rows.jac_sparsity(0, 1).nnz())

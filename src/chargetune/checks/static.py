@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.control.control_step import problem_of
-from chargetune.control.controller import Controller, Limit
+from chargetune.control.controller import Controller, LimitRows
 from chargetune.model.model import Model
 
 __all__ = ["check_horizon", "check_signs", "check_start", "model_at", "noticeable", "row_values"]
@@ -56,7 +56,7 @@ def row_values(
     return np.asarray(np.max(np.array(rows), axis=0), dtype=np.float64)
 
 
-def noticeable(limit: Limit) -> float:
+def noticeable(limit: LimitRows) -> float:
     """The violation of a limit that a check begins to speak of, in its unit."""
     return NOTICEABLE * limit.scale
 

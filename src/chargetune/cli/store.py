@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from chargetune.battery.studies.bdf_export import Format, export
 from chargetune.cli.output import console, shown
-from chargetune.study.store.damaged_reader import Finding
+from chargetune.study.store.damaged_reader import Damage
 from chargetune.study.store.integrity import check_store
 from chargetune.study.store.salvage import salvage
 from chargetune.study.store.store import Store
@@ -72,7 +72,7 @@ def migrate_command(location: str) -> None:
     console().print(f"{shown(location)}: has this program's schema", markup=False, soft_wrap=True)
 
 
-def _facts(findings: Sequence[Finding]) -> list[dict[str, object]]:
+def _facts(findings: Sequence[Damage]) -> list[dict[str, object]]:
     return [{"study": f.study, "trial": f.trial, "what": f.what} for f in findings]
 
 

@@ -19,7 +19,7 @@ from chargetune.model.model import Model, Named
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.runtime.split import split
 
-__all__ = ["Controller", "Limit", "SoftLimit", "Stage"]
+__all__ = ["Controller", "LimitRows", "SoftLimit", "Stage"]
 
 HORIZON_MAX = 50
 CONVEXITY_POINTS = 8
@@ -88,7 +88,7 @@ class SoftLimit:
 
 
 @dataclass(frozen=True)
-class Limit:
+class LimitRows:
     """A `SoftLimit` as a CasADi function (x, u, theta, p, now) -> rows that are <= 0 when it is kept."""
 
     of: str
@@ -117,7 +117,7 @@ class Controller:
     parameters: ca.Function
     stage_cost: ca.Function
     terminal_cost: ca.Function
-    limits: tuple[Limit, ...]
+    limits: tuple[LimitRows, ...]
     input_lower: ca.Function
     input_upper: ca.Function
     fallback: ca.Function
@@ -287,7 +287,7 @@ class _Symbols:
                     f"controller: {label} has curvature {values[0]:.3g} in (x, u), allowed is a convex function (curvature >= 0)"
                 )
 
-    def limit(self, limit: SoftLimit) -> Limit:
+    def limit(self, limit: SoftLimit) -> LimitRows:
         model, s = self.model, self.stage
         if limit.of in model.output_names and not (limit.of in model.state_names and limit.at == "terminal"):
             value = s.y[limit.of]
@@ -306,7 +306,9 @@ class _Symbols:
             # Without the input in it the value at the start of an interval is the value at the end of the one before,
             # and the first one is given: only the end can be controlled.
             at = "end"
-        return Limit(limit.of, self._function(f"limit_{limit.of}", self.row_arguments, ca.vertcat(*rows)), at, limit.penalty, limit.scale)
+        return LimitRows(
+            limit.of, self._function(f"limit_{limit.of}", self.row_arguments, ca.vertcat(*rows)), at, limit.penalty, limit.scale
+        )
 
     @property
     def row_arguments(self) -> list[ca.SX]:

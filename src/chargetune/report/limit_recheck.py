@@ -12,14 +12,14 @@ from chargetune.battery.charging.verdict import judgement
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 
-__all__ = ["Check", "recheck"]
+__all__ = ["LimitCheck", "recheck"]
 
 # Largest difference to the stored excess that is rounding, relative to the bound.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Check:
+class LimitCheck:
     """One limit: the worst value reached and when, its excess beyond the bound (signed), and what the store says.
 
     ``judged`` says on what: the samples, or their moving mean. ``true_excess`` is that of the noise-free signal, where the plant
@@ -46,7 +46,7 @@ class Check:
         return self.stored is None or abs(self.excess - self.stored) <= ROUNDING * max(1.0, abs(self.bound))
 
 
-def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> list[Check]:
+def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> list[LimitCheck]:
     """Each limit over all samples, both ends of every interval, by a formula of its own. Empty for an episode without samples."""
     if not len(episode):
         return []
@@ -57,7 +57,7 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
         # What a held input cannot resolve is no excess.
         worst = int(np.argmax(current) if upper else np.argmin(current))
         excess = float(current[worst] - bound if upper else bound - current[worst])
-        out.append(Check(name, bound, 1e-9, float(current[worst]), float(at_start[worst]), excess, "input", None, None))
+        out.append(LimitCheck(name, bound, 1e-9, float(current[worst]), float(at_start[worst]), excess, "input", None, None))
     stored = {} if score is None else score.excess
     for limit in problem.limits_by_name.values():
         samples, tolerance = judgement(problem, limit)
@@ -66,7 +66,7 @@ def recheck(problem: ChargingProblem, episode: Episode, score: Score | None) -> 
         judged = "samples" if samples == 1 else f"mean of {samples} intervals"
         sign = 1.0 if limit.upper else -1.0
         out.append(
-            Check(
+            LimitCheck(
                 limit.name,
                 limit.bound,
                 tolerance,

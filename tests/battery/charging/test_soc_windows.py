@@ -27,7 +27,7 @@ def ends(episode):
 def test_the_time_to_an_soc_is_the_sum_over_the_windows(wanted):
     windows = ChargingWindows(changed(PROBLEM, charge_time_to_soc=wanted))
     episode = run_charge(PROBLEM)
-    rate, counts = windows.passage(episode).rate, windows.costs > 0
+    rate, counts = windows.window_outputs(episode).rate, windows.costs > 0
     seconds = np.sum((windows.costs * windows.widths / rate)[counts])
     assert wanted in windows.edges
     assert -seconds / windows.duration_s == pytest.approx(score_episode(windows.problem, episode).objective, rel=1e-3)
@@ -36,7 +36,7 @@ def test_the_time_to_an_soc_is_the_sum_over_the_windows(wanted):
 def test_without_a_wanted_soc_the_windows_give_the_mean_squared_lack_of_charge():
     problem = changed(PROBLEM, charge_time_to_soc=None)
     windows, episode = ChargingWindows(problem, windows=50), run_charge(problem)
-    rate = windows.passage(episode).rate
+    rate = windows.window_outputs(episode).rate
     done = np.isfinite(rate)
     cost = np.sum((windows.costs * windows.widths / rate)[done]) / windows.duration_s
     assert -cost == pytest.approx(score_episode(problem, episode).objective, rel=2e-2)
@@ -44,7 +44,7 @@ def test_without_a_wanted_soc_the_windows_give_the_mean_squared_lack_of_charge()
 
 def test_the_excess_of_a_window_is_the_worst_in_the_trace():
     windows, episode = ChargingWindows(PROBLEM), run_charge(PROBLEM)
-    passage = windows.passage(episode)
+    passage = windows.window_outputs(episode)
     _, soc = episode.signal("soc")
     worst = ends(episode).max(axis=1) - 4.2
     for b, (low, high) in enumerate(zip(windows.edges[:-1], windows.edges[1:], strict=True)):
@@ -57,7 +57,7 @@ def test_a_charge_that_gets_stuck_leaves_the_last_windows_open():
     episode = run_charge(PROBLEM, np.full(7, 0.15))
     last = episode.signal("soc")[1][-1]
     assert last < 0.9
-    passage = windows.passage(episode)
+    passage = windows.window_outputs(episode)
     beyond = windows.edges[:-1] > last
     assert np.isnan(passage.rate[beyond]).all()
     assert np.isnan(passage.excess[:, beyond]).all()
@@ -100,7 +100,7 @@ def test_a_sample_that_is_missing_is_left_out():
     episode = run_charge(NOISY, np.full(7, 0.02), 3)
     start = episode.output_start.copy()
     start[100, episode.output_names.index("voltage_V")] = np.nan
-    whole, holed = (ChargingWindows(NOISY).passage(e) for e in (episode, replace(episode, output_start=start)))
+    whole, holed = (ChargingWindows(NOISY).window_outputs(e) for e in (episode, replace(episode, output_start=start)))
     np.testing.assert_allclose(holed.excess, whole.excess, atol=2e-3)
     assert np.isfinite(holed.excess).all()
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from chargetune.learning import Composite
-from chargetune.learning.black_box.composite import Passage, _Data, _near, _Processes, _Surrogate
+from chargetune.learning.black_box.composite import WindowOutputs, _Data, _near, _Processes, _Surrogate
 from chargetune.learning.black_box.optimize_acquisition import reproducible
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
@@ -37,8 +37,8 @@ class Track:
     duration_s = 20.0
     tolerances = np.array([0.02])
 
-    def passage(self, lap):
-        return Passage(lap.speed, lap.seen[None], np.where(np.isfinite(lap.seen), NOISE, np.nan)[None])
+    def window_outputs(self, lap):
+        return WindowOutputs(lap.speed, lap.seen[None], np.where(np.isfinite(lap.seen), NOISE, np.nan)[None])
 
 
 def lap(theta, number=0):

@@ -14,7 +14,7 @@ from chargetune.battery.validation import check_count
 from chargetune.episode.episode import Episode
 
 if TYPE_CHECKING:
-    from chargetune.learning.black_box.composite import Passage
+    from chargetune.learning.black_box.composite import WindowOutputs
 
 __all__ = ["ChargingWindows", "smoothed"]
 
@@ -67,9 +67,9 @@ class ChargingWindows:
     def tolerances(self) -> NDArray[np.float64]:
         return np.array([limit.tolerance for limit in self.problem.limits_by_name.values()])
 
-    def passage(self, episode: Episode) -> Passage:
+    def window_outputs(self, episode: Episode) -> WindowOutputs:
         # torch is needed from here on only.
-        from chargetune.learning.black_box.composite import Passage
+        from chargetune.learning.black_box.composite import WindowOutputs
 
         _, soc = episode.signal("soc")
         passed = np.maximum.accumulate(np.concatenate([[self.problem.episode.soc_start], np.nan_to_num(soc, nan=0.0)]))
@@ -85,7 +85,7 @@ class ChargingWindows:
             deviation = np.hypot(noise * share, EXACT * limit.tolerance)
             excess.append([_worst(beyond[index == b]) for b in range(len(self.widths))])
             spread.append([_worst(deviation[index == b]) for b in range(len(self.widths))])
-        return Passage(self._rate(passed, episode.sampling_time_s), np.array(excess), np.array(spread))
+        return WindowOutputs(self._rate(passed, episode.sampling_time_s), np.array(excess), np.array(spread))
 
     def _rate(self, soc: NDArray[np.float64], sampling_time_s: float) -> NDArray[np.float64]:
         """SOC per second in each window; soc (K+1,) does not decrease."""

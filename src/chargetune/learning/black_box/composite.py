@@ -24,7 +24,7 @@ from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["Composite", "CompositeLoop", "Passage"]
+__all__ = ["Composite", "CompositeLoop", "WindowOutputs"]
 
 # Side of the box around theta_0, in the unit cube, in which the initial points lie.
 DESIGN = 0.6
@@ -48,7 +48,7 @@ SLOWEST = 0.7
 
 
 @dataclass(frozen=True)
-class Passage:
+class WindowOutputs:
     """One episode, cut into w windows of a variable that only increases, such as the state of charge; nan for a window never visited.
 
     rate (w,): mean increase of that variable per second in each window; excess (limits, w): the worst signed excess over each limit
@@ -83,7 +83,7 @@ class CompositeLoop(Protocol):
         """Largest excess over each limit that still counts as kept, shape (limits,)."""
         ...
 
-    def passage(self, episode: Episode) -> Passage:
+    def window_outputs(self, episode: Episode) -> WindowOutputs:
         """What a measured episode did in each window."""
         ...
 
@@ -127,7 +127,7 @@ class Composite:
         seed = self.seed * 100_003 + len(trials)
         with reproducible(seed):
             for u in pending:
-                data = data.believing(u)
+                data = data.kriging_believer(u)
             for k in range(n - len(first)):
                 if not len(data.x):
                     proposed.append(sobol_points(space.dimension, self.seed, self.n_initial + len(trials) + k, 1)[0])
@@ -135,7 +135,7 @@ class Composite:
                 u = self._proposal(data, len(trials) + len(proposed), failed, seed + 7919 * k)
                 proposed.append(u)
                 if k + 1 < n - len(first):
-                    data = data.believing(u)
+                    data = data.kriging_believer(u)
         return space.from_unit(np.vstack([first, *proposed]))
 
     def best(self, space: ParameterSpace, trials: Sequence[TrialLike]) -> int | None:
@@ -181,7 +181,7 @@ class _Data:
             reader = getattr(trial, "episode", None)
             episode = None if reader is None else reader()
             if episode is not None and len(episode) > 1:
-                known.append((index, space.to_unit(np.array(trial.theta)), loop.passage(episode)))
+                known.append((index, space.to_unit(np.array(trial.theta)), loop.window_outputs(episode)))
         windows, limits = len(loop.widths), len(loop.tolerances)
         return cls(
             loop,
@@ -192,7 +192,7 @@ class _Data:
             np.array([p.spread for *_, p in known]).reshape(-1, limits * windows),
         )
 
-    def believing(self, u: NDArray[np.float64]) -> _Data:
+    def kriging_believer(self, u: NDArray[np.float64]) -> _Data:
         """The same data and one more trial at u, whose outputs are the predicted means (kriging believer)."""
         if not len(self.x):
             return self

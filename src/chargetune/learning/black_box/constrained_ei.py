@@ -23,7 +23,7 @@ from chargetune.learning.initial_design import initial_design
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["ConstrainedLogEI", "Limit", "limits_of", "marginals"]
+__all__ = ["ConstrainedLogEI", "LimitSamples", "limits_of", "marginals"]
 
 # Samples of the Monte Carlo form of the acquisition, used with pending points.
 SAMPLES = 128
@@ -34,7 +34,7 @@ REACH = 0.25
 
 
 @dataclass(frozen=True)
-class Limit:
+class LimitSamples:
     """Excess over one limit, or in one window of it, in the trials that have it: transformed by asinh, kept where <= ``bound``."""
 
     name: str
@@ -43,7 +43,7 @@ class Limit:
     bound: float
 
 
-def limits_of(trials: Sequence[TrialLike]) -> list[Limit]:
+def limits_of(trials: Sequence[TrialLike]) -> list[LimitSamples]:
     """The limits that can restrict theta, from the finished trials; each window of a profile counts as a limit.
 
     The transform is monotone and maps the tolerance to the bound, so that it does not change which limits are kept. A window that an
@@ -69,7 +69,7 @@ def limits_of(trials: Sequence[TrialLike]) -> list[Limit]:
         if len(values) < 3 or (worst <= tolerance and worst < -REACH * spread):
             continue
         scale = SCALE_TOLERANCES * tolerance or 0.1 * float(np.median(np.abs(values))) or 1.0
-        out.append(Limit(name, rows.astype(np.int64), np.arcsinh(values / scale), float(np.arcsinh(tolerance / scale))))
+        out.append(LimitSamples(name, rows.astype(np.int64), np.arcsinh(values / scale), float(np.arcsinh(tolerance / scale))))
     return out
 
 

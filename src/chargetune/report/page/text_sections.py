@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
-from chargetune.report.limit_recheck import Check, recheck
+from chargetune.report.limit_recheck import LimitCheck, recheck
 from chargetune.report.page.html import Cell, paragraph, section, table
 from chargetune.report.page.trial_rows import study_head
 from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
@@ -131,7 +131,7 @@ def _stored(trial: Trial | None) -> list[tuple[str, float, float]]:
     return [] if score is None else [(name, value, score.tolerance.get(name, 0.0)) for name, value in score.excess.items()]
 
 
-def _check_table(caption: str, checks: Sequence[Check]) -> str:
+def _check_table(caption: str, checks: Sequence[LimitCheck]) -> str:
     rows: list[tuple[Cell, ...]] = [
         (
             c.name, c.bound, c.reached, c.at_s / 60, c.excess, c.tolerance, c.judged, c.true_excess,

@@ -19,7 +19,7 @@ from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.store.trace import content_sha256, decode
 from chargetune.study.trial import TrialStatus
 
-__all__ = ["Content", "Finding", "Key", "Step", "columns", "opened", "read_content", "read_traces"]
+__all__ = ["Content", "Damage", "Key", "Step", "columns", "opened", "read_content", "read_traces"]
 
 # (id of the study, number of the trial)
 Key = tuple[int, int]
@@ -30,7 +30,7 @@ STRAY = 5000
 
 
 @dataclass(frozen=True)
-class Finding:
+class Damage:
     """Something that is not as it was stored. ``study`` and ``trial`` are None where it concerns no single one."""
 
     study: str | None
@@ -50,7 +50,7 @@ class Content:
     studies: Mapping[int, Row[Any]]
     trials: Mapping[Key, Row[Any]]
     results: Mapping[int, Row[Any]]
-    findings: tuple[Finding, ...]
+    findings: tuple[Damage, ...]
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def columns(row: Row[Any]) -> dict[str, Any]:
 
 def read_content(database: Database, engine: Engine) -> Content:
     """Every study and trial that can be read and is consistent in itself."""
-    findings: list[Finding] = []
+    findings: list[Damage] = []
     names: dict[int, str] = {}
     studies: dict[int, Row[Any]] = {}
     trials: dict[Key, Row[Any]] = {}
@@ -91,7 +91,7 @@ def read_content(database: Database, engine: Engine) -> Content:
         names[row.id] = str(row.name)
         wrong = _study_fault(row)
         if wrong:
-            findings.append(Finding(names[row.id], None, wrong))
+            findings.append(Damage(names[row.id], None, wrong))
         else:
             studies[row.id] = row
     for row in _rows(database, engine, schema.trial, findings):
@@ -99,16 +99,16 @@ def read_content(database: Database, engine: Engine) -> Content:
         name = names.get(key[0], f"(number {key[0]}, its description is lost)")
         wrong = _trial_fault(row)
         if wrong:
-            findings.append(Finding(name, key[1], wrong))
+            findings.append(Damage(name, key[1], wrong))
         elif key[0] not in studies:
-            findings.append(Finding(name, key[1], "its study is damaged"))
+            findings.append(Damage(name, key[1], "its study is damaged"))
         else:
             trials[key] = row
     for study in studies:
         numbers = {number for owner, number in trials if owner == study}
         known = {f.trial for f in findings if f.study == names[study]}
         missing = sorted(set(range(min(numbers, default=0), max(numbers, default=-1) + 1)) - numbers - known - {None})
-        findings += [Finding(names[study], number, "missing") for number in missing]
+        findings += [Damage(names[study], number, "missing") for number in missing]
     results: dict[int, Row[Any]] = {}
     for row in _rows(database, engine, schema.result, findings):
         # A result whose trial is lost is none, and the trial is among the findings.
@@ -117,25 +117,25 @@ def read_content(database: Database, engine: Engine) -> Content:
     return Content(names, studies, trials, results, tuple(findings))
 
 
-def read_traces(database: Database, engine: Engine, content: Content, step: Step | None = None) -> Iterator[tuple[Key, Row[Any] | Finding]]:
+def read_traces(database: Database, engine: Engine, content: Content, step: Step | None = None) -> Iterator[tuple[Key, Row[Any] | Damage]]:
     """The trace of each whole trial that has one, as a row, or what is wrong with it."""
     due = {key: row.trace_sha256 for key, row in content.trials.items() if row.trace_sha256 is not None}
-    total, lost = len(due), list[Finding]()
+    total, lost = len(due), list[Damage]()
     for row in _rows(database, engine, schema.trace, lost):
         key = (row.study_id, row.number)
         name = content.names.get(key[0], str(key[0]))
         if key in due:
             wrong = _trace_fault(row, due.pop(key))
-            yield key, Finding(name, key[1], wrong) if wrong else row
+            yield key, Damage(name, key[1], wrong) if wrong else row
         elif key in content.trials:
-            yield key, Finding(name, key[1], "a trace, but the trial says that it has none")
+            yield key, Damage(name, key[1], "a trace, but the trial says that it has none")
         if step is not None:
             step(total - len(due), total)
     for key in due:
-        yield key, Finding(content.names[key[0]], key[1], "its trace is missing or cannot be read")
+        yield key, Damage(content.names[key[0]], key[1], "its trace is missing or cannot be read")
 
 
-def _rows(database: Database, engine: Engine, table: Table, findings: list[Finding]) -> Iterator[Row[Any]]:
+def _rows(database: Database, engine: Engine, table: Table, findings: list[Damage]) -> Iterator[Row[Any]]:
     """Each row by its key. What cannot be read goes to ``findings``, as one for the table."""
     lost, why = 0, ""
     # SQLite finds a row by its number without the index, and a number without a row costs microseconds.
@@ -167,7 +167,7 @@ def _rows(database: Database, engine: Engine, table: Table, findings: list[Findi
             break
     if lost:
         many = "rows" if last is None else f"{lost} of at most {last} rows"
-        findings.append(Finding(None, None, f"{many} of the table {table.name} cannot be read ({why})"))
+        findings.append(Damage(None, None, f"{many} of the table {table.name} cannot be read ({why})"))
 
 
 def _study_fault(row: Row[Any]) -> str:

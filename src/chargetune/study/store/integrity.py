@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy.exc import DBAPIError
 
-from chargetune.study.store.damaged_reader import Finding, Step, opened, read_content, read_traces
+from chargetune.study.store.damaged_reader import Damage, Step, opened, read_content, read_traces
 from chargetune.study.store.database import database_at
 
 __all__ = ["Verdict", "check_store"]
@@ -21,7 +21,7 @@ class Verdict:
     studies: int
     trials: int
     traces: int
-    findings: tuple[Finding, ...]
+    findings: tuple[Damage, ...]
 
 
 def check_store(location: str | os.PathLike[str], step: Step | None = None) -> Verdict:
@@ -38,12 +38,12 @@ def check_store(location: str | os.PathLike[str], step: Step | None = None) -> V
         except DBAPIError as error:
             damage = database.explain(error)
         if damage:
-            findings.append(Finding(None, None, f"the database is damaged ({_short(damage)})"))
+            findings.append(Damage(None, None, f"the database is damaged ({_short(damage)})"))
         content = read_content(database, engine)
         traces = 0
         for _, found in read_traces(database, engine, content, step):
-            traces += not isinstance(found, Finding)
-            findings += [found] if isinstance(found, Finding) else []
+            traces += not isinstance(found, Damage)
+            findings += [found] if isinstance(found, Damage) else []
     return Verdict(database.label, len(content.studies), len(content.trials), traces, (*content.findings, *findings))
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, insert, select, update
 
 from chargetune.study.serialization import canonical_json
 from chargetune.study.store import schema
-from chargetune.study.store.damaged_reader import Finding, Key, Step, columns, opened, read_content, read_traces
+from chargetune.study.store.damaged_reader import Damage, Key, Step, columns, opened, read_content, read_traces
 from chargetune.study.store.database import database_at
 from chargetune.study.store.store import Store, StoreError
 
@@ -25,7 +25,7 @@ class Salvage:
     studies: int
     trials: int
     traces: int
-    left: tuple[Finding, ...]
+    left: tuple[Damage, ...]
 
 
 def salvage(source: str | os.PathLike[str], target: str | os.PathLike[str], step: Step | None = None) -> Salvage:
@@ -43,7 +43,7 @@ def salvage(source: str | os.PathLike[str], target: str | os.PathLike[str], step
         if store.studies():
             raise StoreError(f"{store.label}: there are studies in it, allowed is a new store")
         content = read_content(database, engine)
-        lost: dict[Key, Finding] = {}
+        lost: dict[Key, Damage] = {}
 
         def copy(connection: Connection) -> int:
             lost.clear()
@@ -57,7 +57,7 @@ def salvage(source: str | os.PathLike[str], target: str | os.PathLike[str], step
             for study_id, result in content.results.items():
                 connection.execute(insert(schema.result).values({**columns(result), "study_id": ids[study_id]}))
             for key, found in read_traces(database, engine, content, step):
-                if isinstance(found, Finding):
+                if isinstance(found, Damage):
                     lost[key] = found
                     continue
                 connection.execute(insert(schema.trace).values({**columns(found), "study_id": ids[key[0]]}))
