@@ -8,6 +8,7 @@ import pytest
 from commands import chargetune
 
 from chargetune.battery.case_study.reproduce import seed_run
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.studies.bdf_export import export
 from chargetune.battery.studies.campaign import load_campaign, standings
 from chargetune.battery.studies.open_study import open_study
@@ -105,7 +106,7 @@ def test_the_believed_one_is_the_result_everywhere(folder):
     path = folder / "s.sqlite"
     (entry,) = load_campaign(folder / "campaign.toml")
     with Store(path) as store, open_study(store, entry.config, entry.folder) as study:
-        study.advance(entry.config.problem(entry.folder), 6)
+        study.advance(Evaluation(entry.config.problem(entry.folder)), 6)
         trials = study.trials()
         measured = best_feasible(trials)
         believed = best_feasible(t for t in trials if t != measured)

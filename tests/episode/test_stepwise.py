@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import plant_of
 from chargetune.control.control_step import act
 from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
 from chargetune.control.sqp import SolveStatus
@@ -285,20 +287,20 @@ ESTIMATORS = {
 @settings(max_examples=40)
 @given(faults=FAULTS, seed=st.integers(0, 3))
 def test_every_input_is_finite_and_within_its_limits_under_any_fault(charging, estimator, faults, seed):
-    controller = replace(charging.controller, estimator=ESTIMATORS[estimator])
-    plant = Watched(Faulty(charging.plant, faults))
+    controller = replace(controller_of(charging), estimator=ESTIMATORS[estimator])
+    plant = Watched(Faulty(plant_of(charging), faults))
     episode = run_episode(controller, plant, steps=20, seed=seed)
     currents = np.array(plant.inputs_seen)
     assert np.all(np.isfinite(currents))
-    assert np.all((currents >= 0.0) & (currents <= charging.plant_cell.current_max_A))
+    assert np.all((currents >= 0.0) & (currents <= charging.cell.current_max_A))
     assert plant.closes == 1
     assert len(episode) == 20 or episode.ending is not Ending.DONE
     assert episode.ending in {Ending.DONE, Ending.SENSOR, Ending.SOLVER, Ending.PLANT}
 
 
 def test_a_voltage_bias_does_not_steer_a_controller_that_does_not_read_it(charging):
-    biased = Faulty(charging.plant, [Fault(FaultKind.BIAS, 0, 100, ("voltage_V",), 0.010)])
-    sound, wrong = (run_episode(charging.controller, plant, steps=30) for plant in (charging.plant, biased))
+    biased = Faulty(plant_of(charging), [Fault(FaultKind.BIAS, 0, 100, ("voltage_V",), 0.010)])
+    sound, wrong = (run_episode(controller_of(charging), plant, steps=30) for plant in (plant_of(charging), biased))
     np.testing.assert_array_equal(sound.input, wrong.input)
     np.testing.assert_allclose(wrong.output_end[:, 0] - sound.output_end[:, 0], 0.010, rtol=0, atol=1e-12)
 
@@ -306,10 +308,10 @@ def test_a_voltage_bias_does_not_steer_a_controller_that_does_not_read_it(chargi
 def test_a_latch_outside_the_controller_stops_what_the_controller_does_not_see(charging):
     # The controller's model is wrong: it drives the cell over its limit, which is what the study is about.
     limit = charging.voltage_max_V
-    free = run_episode(charging.controller, charging.plant, steps=120)
+    free = run_episode(controller_of(charging), plant_of(charging), steps=120)
     worst = np.maximum(*free.signal("voltage_V"))
     assert worst.max() > limit + 0.01
-    stopped = run_episode(charging.controller, charging.plant, steps=120, trips=[Trip("voltage_V", 2.5, limit + 0.01)])
+    stopped = run_episode(controller_of(charging), plant_of(charging), steps=120, trips=[Trip("voltage_V", 2.5, limit + 0.01)])
     assert stopped.ending is Ending.LIMIT
     assert len(stopped) == int(np.argmax(worst > limit + 0.01)) + 1
     assert math.isclose(float(stopped.input[-1, 0]), float(free.input[len(stopped) - 1, 0]))

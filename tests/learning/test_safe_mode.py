@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_loop import SPACE, TOLERANCE, UNKNOWNS, Plant, Told, ToyLoop, structural
 
-from chargetune.learning import NoSafeThetaError, Safety, TwinTuner, Uncertain
+from chargetune.learning import ConstrainedLogEI, NoSafeThetaError, Safety, TwinTuner, Uncertain
 from chargetune.learning.candidates import Proposal
 from chargetune.learning.safe_mode import safe_thetas
 from chargetune.learning.twin.calibration import SCALES, PredictionCheck
@@ -112,13 +112,17 @@ def after_one_trial(level=2.5, **settings):
 def test_the_longest_part_of_the_way_that_is_safe_is_gone():
     proposal, theta = after_one_trial()
     shares = proposal.ensemble.settings.steps_back
+
+    def accepted(theta):
+        return proposal.accepts(proposal.candidate(theta))
+
     for level in (1.8, 1.2, 0.3):
         aim = np.full(3, level)
-        found = proposal.backtrack(theta, aim)
-        passed = [s for s in shares if proposal.accepts(proposal.candidate(theta + s * (aim - theta)))]
+        found = proposal.backtrack(theta, aim, accepted)
+        passed = [s for s in shares if accepted(theta + s * (aim - theta))]
         assert passed
-        np.testing.assert_allclose(found[0], theta + passed[0] * (aim - theta), rtol=1e-12)
-    assert proposal.backtrack(np.full(3, 1.0), np.full(3, 0.3)) is None
+        np.testing.assert_allclose(found, theta + passed[0] * (aim - theta), rtol=1e-12)
+    assert proposal.backtrack(np.full(3, 1.0), np.full(3, 0.3), accepted) is None
 
 
 def test_what_only_the_plants_it_was_chosen_by_allow_is_not_proposed(monkeypatch):
@@ -184,8 +188,9 @@ def test_a_twin_that_is_none_repeats_the_best_trial_and_says_so():
     assert condition(ToyLoop(), trials).rejected
     assert [t.score.feasible for t in trials] == [True] * 3
     best = max(trials, key=lambda t: t.score.objective)
-    with pytest.warns(RuntimeWarning, match="is no model of this plant: .*; the best trial is repeated"):
-        np.testing.assert_array_equal(TwinTuner(ToyLoop()).ask(SPACE, trials, 2), [best.theta] * 2)
+    # Without a promise the black box goes on, and it learns from these trials.
+    with pytest.warns(RuntimeWarning, match="is no model of this plant: .*; this proposal is the black box's"):
+        np.testing.assert_array_equal(TwinTuner(ToyLoop()).ask(SPACE, trials, 2), ConstrainedLogEI(0, n_initial=0).ask(SPACE, trials, 2))
     with pytest.warns(RuntimeWarning, match="is no model of this plant: .* is proposed again"):
         np.testing.assert_array_equal(SAFE.ask(SPACE, trials, 2), [best.theta] * 2)
     broken = [replace(t, score=replace(t.score, excess={"gauge": 1.0})) for t in trials]
