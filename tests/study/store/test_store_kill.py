@@ -7,7 +7,7 @@ from pathlib import Path
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "store_kill.py"
 # Three of ten kills hit a running trial: with so many at least one does, but for one run in a thousand on a busy machine.
-KILLS = 20
+KILLS = 30
 
 
 def test_three_writers_killed_at_random(location):
@@ -21,5 +21,5 @@ def test_three_writers_killed_at_random(location):
     assert found["kills"] == KILLS + 3  # at the end the three that are left
     assert found["acknowledged"] >= 10
     assert found["told"] >= found["acknowledged"]
-    assert found["kills_with_a_running_trial"] >= 1  # the kills hit a study at work
+    assert found["kills_with_a_running_trial"] >= 2  # the kills hit a study at work
     assert found["begun_again"] <= found["kills"]
