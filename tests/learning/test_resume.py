@@ -23,7 +23,7 @@ PROBLEM = charging_problem(
     default_cell(), mismatch_seed=1, R0=ResistanceRatio(0.1, 4.0, scale=True), voltage_noise_sd_V=0.002,
     soc_start=0.7, steps=24, verdict_samples=3,
 )  # fmt: skip
-FEW = TwinSettings(plants=16, judges=32, scales=4, rounds=3)
+FEW = TwinSettings(plants=16, judges=32, rounds=3)
 
 
 def filled(theta, seed):
