@@ -16,7 +16,7 @@ from chargetune.study.store.salvage import salvage
 from chargetune.study.store.store import Store, StoreError
 from chargetune.study.warm_start import Earlier
 
-TRIALS = 40
+TRIALS = 16
 
 
 @pytest.fixture(scope="module")
