@@ -12,24 +12,15 @@ from chargetune.study.store.store import Store
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def client():
     # One death of a worker is told at once, instead of after Dask's own three repetitions.
     settings = {"distributed.scheduler.allowed-failures": 0, "distributed.worker.daemon": True}
     with (
         dask.config.set(settings),
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made,
-        Client(made) as connected,
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as connected,
     ):
-        yield made, connected
-
-
-@pytest.fixture
-def client(cluster):
-    """Two workers are there, also where the test before has killed one and the machine is slow to start another."""
-    made, connected = cluster
-    made.scale(2)
-    connected.wait_for_workers(2, timeout=120)
-    return connected
+        yield connected
 
 
 def uninterrupted(tmp_path, trials, **changes):
