@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -130,7 +131,7 @@ class ChargingProblem:
         """The lower voltage limit: the problem's own, else the cell's."""
         return self.limits_by_name["voltage_min_V"].bound
 
-    @property
+    @cached_property
     def limits_by_name(self) -> dict[str, Limit]:
         """Every limit that is set, in the order of the score: voltage_max_V, voltage_min_V, temperature_max_K, anode_min_V."""
         return self.limits.by_name(self.cell)
