@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.validation import check_number
 from chargetune.model.model import Signal
-from chargetune.plants.plant import Measurement, PlantError
+from chargetune.plants.plant import Measurement, PlantError, SetUpError
 from chargetune.plants.sensors import Readout, Sensors
 
 __all__ = ["CellState", "Electrochemical", "ElectrochemicalPlant"]
@@ -234,7 +234,12 @@ def _built(settings: Electrochemical, soc_start: float) -> _Built:
     """The discretised model at rest at ``soc_start``; 0.2 s, after 2 s for the import of pybamm."""
     # PyBaMM would ask on the terminal whether it may report usage.
     os.environ.setdefault("PYBAMM_DISABLE_TELEMETRY", "true")
-    import pybamm
+    try:
+        import pybamm
+    except ImportError as error:
+        raise SetUpError(
+            f"an electrochemical plant needs PyBaMM, which cannot be imported ({error}): pip install chargetune[pybamm]"
+        ) from error
 
     # Warnings that inputs are missing where only the initial state is computed.
     pybamm.set_logging_level("ERROR")
@@ -289,20 +294,20 @@ def _is_file(parameters: str) -> bool:
 
 
 def _parameters(settings: Electrochemical) -> Any:
-    """A fresh set of parameter values. Raises ValueError for an unknown name, FileNotFoundError for a missing file."""
+    """A fresh set of parameter values. Raises SetUpError for an unknown name, and for a file that is missing or is none."""
     import pybamm
 
     if _is_file(settings.parameters):
         if not Path(settings.parameters).is_file():
-            raise FileNotFoundError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
+            raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
         try:
             return pybamm.ParameterValues.create_from_bpx(settings.parameters)
         except Exception as error:
             # Its parser raises what pydantic, json and pybamm raise.
-            raise ValueError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
+            raise SetUpError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
     known = sorted(pybamm.parameter_sets.keys())
     if settings.parameters not in known:
-        raise ValueError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")
+        raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")
     return pybamm.ParameterValues(settings.parameters)
 
 
