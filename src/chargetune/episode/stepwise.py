@@ -14,7 +14,7 @@ from chargetune.control.control_step import Act, act, begin
 from chargetune.control.controller import Controller
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
-from chargetune.plants.plant import Measurement, Plant, PlantError
+from chargetune.plants.plant import Measurement, Plant, PlantError, SetUpError
 
 __all__ = ["check_run", "run_episode", "signal_indices"]
 
@@ -59,6 +59,9 @@ def run_episode(
             broken = broken + 1 if info.status == SolveStatus.FALLBACK else 0
             if blind >= BLIND_MAX or broken >= BLIND_MAX or tripped(plant, measurement, trips):
                 break
+    except SetUpError:
+        # No interval of it could ever run, so there is no episode to tell of.
+        raise
     except PlantError as error:
         ending, message = Ending.PLANT, str(error)
     except KeyboardInterrupt:
@@ -78,7 +81,7 @@ def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
     """What the plant answers; anything it raises, and an answer of the wrong shape, is a `PlantError`."""
     try:
         measurement = call()
-    except PlantError:
+    except (PlantError, SetUpError):
         raise
     except Exception as error:
         raise PlantError(f"the plant raised {type(error).__name__}: {error}") from error

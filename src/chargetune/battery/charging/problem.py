@@ -20,7 +20,7 @@ from chargetune.battery.charging.settings import (
     SensorSettings,
 )
 from chargetune.battery.charging.tunables import Tunables
-from chargetune.battery.validation import check_number
+from chargetune.battery.validation import check_count, check_number
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
@@ -63,7 +63,9 @@ class ChargingProblem:
         except TypeError as error:
             raise ValueError(f"plant = {self.plant!r}, allowed is data that can be hashed, such as a frozen dataclass: {error}") from error
         if self.objective.charge_time_to_soc is not None:
-            check_number("charge_time_to_soc", self.objective.charge_time_to_soc, self.episode.soc_start, 1.0, "", open_low=True)
+            most = self.episode.soc_target
+            check_number("charge_time_to_soc", self.objective.charge_time_to_soc, self.episode.soc_start, most, "", open_low=True)
+        check_count("verdict_samples", self.objective.verdict_samples, 1, self.episode.steps)
         believed = self.episode.soc_start + self.estimator.soc_start_error
         check_number("believed SOC at the start (soc_start + soc_start_error)", believed, 0.0, 1.0)
         self._check_bounds()
