@@ -35,7 +35,7 @@ class Uniform:
             raise ValueError(f"uniform: lower = {self.lower!r}, allowed is at most upper = {self.upper!r}")
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self.lower + (self.upper - self.lower) * share
+        return np.asarray(self.lower + (self.upper - self.lower) * share)
 
 
 @dataclass(frozen=True)
