@@ -83,7 +83,8 @@ class Choice:
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
         index = np.minimum((share * len(self.values)).astype(int), len(self.values) - 1)
-        return np.asarray(self.values, dtype=float)[index]
+        chosen: NDArray[np.float64] = np.asarray(self.values, dtype=np.float64)[index]
+        return chosen
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,11 @@ __all__ = ["RangeLoop", "SimulatedRange"]
 class RangeLoop(Protocol):
     """Draws of a range of use, and closed loops on them that are judged by their true outputs."""
 
+    @property
+    def largest_of(self) -> tuple[str, ...]:
+        """Metrics of which the largest of all plants counts; of the others it is their mean."""
+        ...
+
     def draw(self, count: int, seed: int) -> Sequence[DrawnPlant]:
         """So many plants with their episodes; more draws of a seed begin with the same ones."""
         ...
@@ -31,8 +36,8 @@ class RangeLoop(Protocol):
         """The episode of each theta on the plant of the same place, with its true outputs; None where it did not come to its end."""
         ...
 
-    def score(self, episode: Episode) -> Score | None:
-        """The verdict on an episode; None when it has none."""
+    def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:
+        """The verdict on an episode, without figures for people where ``metrics`` is False; None when it has none."""
         ...
 
     def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
@@ -52,6 +57,7 @@ class SimulatedRange:
     steps: int
     limits: tuple[ScoredLimit, ...]
     objective: Callable[[Episode], float]
+    largest_of: tuple[str, ...] = ()
 
     def draw(self, count: int, seed: int) -> list[DrawnPlant]:
         return self.range_of_use.draw(count, seed)
@@ -60,7 +66,7 @@ class SimulatedRange:
         episodes = self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
         return [e.noise_free() if e.ending is Ending.DONE else None for e in episodes]
 
-    def score(self, episode: Episode) -> Score | None:
+    def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:
         return score_limits(episode, self.limits, objective=self.objective).score
 
     def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:

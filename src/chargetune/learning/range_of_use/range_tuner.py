@@ -89,8 +89,12 @@ class RangeTuner:
         return out
 
     def _first(self, space: ParameterSpace, search: _RangeSearch) -> NDArray[np.float64]:
-        """The best of theta_0 and Sobol points on a few plants."""
-        points = [space.to_unit(space.default), *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
+        """The best of theta_0, the two extreme corners and Sobol points on a few plants.
+
+        A start within the limits matters: where the input is saturated, a violation does not change with theta.
+        """
+        corners = [np.zeros(space.dimension), np.ones(space.dimension)]
+        points = [space.to_unit(space.default), *corners, *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
         return min(points, key=search.merit)
 
 
@@ -117,7 +121,7 @@ class _RangeSearch:
         theta = self._space.from_unit(np.clip(u, 0.0, 1.0))
         rows, worth = [], []
         for episode in self._loop.simulate([theta] * len(plants), plants):
-            score: Score | None = None if episode is None else self._loop.score(episode)
+            score: Score | None = None if episode is None else self._loop.score(episode, metrics=False)
             if episode is None or score is None:
                 return None
             excess, _ = samples_of(score, self._loop.samples(episode), self._settings.aim)

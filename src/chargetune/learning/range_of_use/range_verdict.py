@@ -55,7 +55,8 @@ class RangeEvaluation:
     """What a study runs: a trial is one theta on ``plants`` draws that are made of the trial's own seed.
 
     So no draw that chose a theta judges it. The score's objective is that over the plants, its excesses are the worst of any plant;
-    ``metrics`` hold how many plants broke a limit, of how many, and every figure of the plants as mean. The trace is that of the plant
+    ``metrics`` hold how many plants broke a limit, of how many, and every figure of
+    the plants as mean, or as largest (`RangeLoop.largest_of`). The trace is that of the plant
     with the largest excess; all others follow from the seed. A plant whose episode did not come to its end fails the trial.
     """
 
@@ -91,7 +92,8 @@ class RangeEvaluation:
         for name in scores[0].metrics:
             values = [v for score in scores if (v := score.metrics.get(name)) is not None]
             # A mean over those that got there would praise the theta that leaves the slow ones out.
-            metrics[name] = float(np.mean(values)) if len(values) == len(scores) else None
+            over = max if name in self.loop.largest_of else np.mean
+            metrics[name] = float(over(values)) if len(values) == len(scores) else None
         return Score(
             objective=objective_over(self.aim, [score.objective for score in scores]),
             performance=objective_over(self.aim, [score.performance for score in scores]),
