@@ -17,10 +17,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging.checks import check_charging
-from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.verdict import charge_time, violation_mVs
-from chargetune.battery.studies.open_study import open_study
+from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
@@ -139,9 +138,9 @@ def _run(
         try:
             # Without batches more workers have something to do only if the order of the trials is given up for them; and
             # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner == "iterative_learning"
+            alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
             ahead = workers if workers > 1 and not alone else None
-            study.run(Evaluation(problem), count, executor=executor, workers=ahead, progress=note)
+            study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
         everything = study.trials()[:count]
