@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.checks.finding import Evidence, Finding
-from chargetune.control.control_step import problem_of
+from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller
 from chargetune.model.parameter_space import ParameterSpace
 
@@ -118,6 +118,6 @@ def check_theta(worst: Callable[[NDArray[np.float64]], float], space: ParameterS
 
 def _ranges(controller: Controller) -> NDArray[np.float64]:
     problem, nu = problem_of(controller), len(controller.model.inputs)
-    q = problem.prepare(controller.theta.default, controller.setpoint, controller.model.nominal)
-    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(np.array(controller.start), q))
+    now = problem.first(controller.start, controller.input_before)
+    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(now, numbers(controller, controller.theta.default)))
     return np.asarray(np.maximum(upper - lower, 1e-9), dtype=np.float64)

@@ -216,9 +216,10 @@ def _costs(controller: Controller, run: Episode, theta: ArrayLike | None) -> NDA
     if run.state is None:
         raise ValueError("the episode has no state")
     values, count, x = controller.theta_vector(theta), len(run), run.state[:-1]
-    p = controller.parameters(values, controller.model.nominal)
+    p = controller.parameters(values, controller.model.nominal, np.zeros(len(controller.given)))
     fixed: list[Any] = [ca.repmat(ca.DM(v), 1, count) for v in (values, p, np.array(controller.setpoint))]
-    cost = np.array(controller.stage_cost.map(count)(x.T, run.input.T, *fixed, x.T)).ravel()
+    before, signals = np.vstack([controller.input_before, run.input[:-1]]), np.zeros((len(controller.given), count))
+    cost = np.array(controller.stage_cost.map(count)(x.T, run.input.T, *fixed, x.T, before.T, signals)).ravel()
     for j, limit in enumerate(controller.limits):
         if limit.at != "terminal":
             beyond = _seen(controller, j, run, theta)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.checks.finding import Evidence, Finding
-from chargetune.control.control_step import problem_of
+from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller, LimitRows
 from chargetune.model.model import Model
 
@@ -26,10 +26,11 @@ INTEGRATES, OVER = 1e-6, 3.0
 POINTS = 40
 
 
-def model_at(controller: Controller, theta: ArrayLike | None = None) -> Model:
-    """The controller's model with the parameters it has at theta (None: untuned)."""
+def model_at(controller: Controller, theta: ArrayLike | None = None, given: ArrayLike | None = None) -> Model:
+    """The controller's model with the parameters it has at theta (None: untuned) and at values of its given signals (None: 0)."""
     model = controller.model
-    values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal)).ravel()
+    signals = np.zeros(len(controller.given)) if given is None else np.asarray(given, dtype=np.float64)
+    values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal, signals)).ravel()
     named, first = {}, 0
     for name, size in model.parameter_blocks.items():
         named[name] = values[first : first + size]
@@ -44,15 +45,23 @@ def row_values(
     u: NDArray[np.float64],
     theta: ArrayLike | None = None,
     now: NDArray[np.float64] | None = None,
+    *,
+    last: NDArray[np.float64] | None = None,
+    given: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """The largest row of a limit (positive: beyond it, in its unit) at states (K, nx) and inputs (K, nu), shape (K,).
 
-    ``now`` (K, nx) are the states at which the controller solved, by default x.
+    ``now`` (K, nx) are the states at which the controller solved, by default x; ``last`` (K, nu) the inputs before, by default that
+    before the first interval; ``given`` (K, signals) the given signals, by default 0.
     """
     values, count = controller.theta_vector(theta), len(x)
-    p = controller.parameters(values, controller.model.nominal)
-    fixed = (ca.repmat(ca.DM(values), 1, count), ca.repmat(p, 1, count))
-    rows = controller.limits[limit].rows.map(count)(x.T, u.T, *fixed, (x if now is None else now).T)
+    signals = np.zeros((count, len(controller.given))) if given is None else given
+    before = np.tile(controller.input_before, (count, 1)) if last is None else last
+    p = controller.parameters.map(count)(
+        ca.repmat(ca.DM(values), 1, count), ca.repmat(ca.DM(controller.model.nominal), 1, count), signals.T
+    )
+    fixed = (ca.repmat(ca.DM(values), 1, count), p, (x if now is None else now).T)
+    rows = controller.limits[limit].rows.map(count)(x.T, u.T, *fixed, before.T, signals.T)
     return np.asarray(np.max(np.array(rows), axis=0), dtype=np.float64)
 
 
@@ -103,8 +112,9 @@ def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple
     values = controller.theta_vector(theta)
     problem, nu = problem_of(controller), len(controller.model.inputs)
     start = np.array(controller.start)
-    q = problem.prepare(values, controller.setpoint, controller.model.nominal)
-    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(start, q))
+    lower, upper = (
+        np.array(bound).ravel()[:nu] for bound in problem.bounds(problem.first(start, controller.input_before), numbers(controller, values))
+    )
     each = [sorted({low, high, float(np.clip(0.0, low, high))}) for low, high in zip(lower, upper, strict=True)]
     choices = np.array(list(itertools.product(*each)))
     out = []

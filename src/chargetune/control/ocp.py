@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.controller import Controller
 from chargetune.control.estimators import finite
@@ -29,9 +30,13 @@ class Problem:
 
     prepare
         (theta, setpoint, p_nominal) -> q, everything that is fixed over an episode (spline coefficients, weights):
-        no other function sees theta or p.
+        no other function sees theta or p. Where there are given signals the q of the others is this one and below it
+        the signals over the horizon, a row of `model.given.windows` (`control_step.numbers`).
     bounds
-        (now, q) -> (lower, upper), the input bounds repeated over the horizon, shapes (N nu,).
+        (now, q) -> (lower, upper), the input bounds over the horizon, shapes (N nu,). ``now`` is the estimate and below it
+        the last values of the inputs that are `Controller.carried`; it is the first state of the horizon.
+    clip
+        (now, U, q) -> the inputs nearest to U, one after the other, that keep bounds and rates.
     sweep
         (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
     quadratic
@@ -50,12 +55,13 @@ class Problem:
     correct, predict
         The estimator: (memory, y, u, q) -> (x_hat, memory); (x_hat, memory, u, q) -> memory.
     groups
-        For each row the index of its limit.
+        For each row the index of its limit, -1 for a row that is hard: the rate of an input.
     """
 
     controller: Controller
     prepare: ca.Function
     bounds: ca.Function
+    clip: ca.Function
     sweep: ca.Function
     quadratic: ca.Function
     curvature: ca.Function
@@ -74,7 +80,38 @@ class Problem:
     @property
     def row_width(self) -> int:
         """Rows of c in one stage; the terminal rows follow after the last stage."""
-        return sum(limit.rows.size1_out(0) * (2 if limit.at == "both" else 1) for limit in self.controller.limits if limit.at != "terminal")
+        own = self.controller
+        soft = sum(limit.rows.size1_out(0) * (2 if limit.at == "both" else 1) for limit in own.limits if limit.at != "terminal")
+        return soft + 2 * len(own.rated)
+
+    def first(self, estimate: ArrayLike, last: ArrayLike) -> NDArray[np.float64]:
+        """``now`` of an estimated state and the last input."""
+        return np.concatenate([np.asarray(estimate, dtype=np.float64), np.asarray(last, dtype=np.float64)[list(self.controller.carried)]])
+
+
+@dataclass(frozen=True)
+class _Window:
+    """q = (what is fixed over an episode; g_{-1}, g_0 .. g_N): which part of it a stage reads."""
+
+    fixed: int
+    signals: int
+    horizon: int
+
+    @property
+    def length(self) -> int:
+        return self.fixed + self.signals * (self.horizon + 2)
+
+    @property
+    def own(self) -> int:
+        """Numbers of one stage: the fixed ones, and the signals at its start and at its end."""
+        return self.fixed + 2 * self.signals
+
+    def at(self, q: Any, stage: int) -> Any:
+        """What stage i of 0 .. N reads; -1 is the interval before."""
+        if not self.signals:
+            return q
+        fixed, *signals = split(q, (self.fixed, *[self.signals] * (self.horizon + 2)))
+        return ca.vertcat(fixed, signals[stage + 1], signals[min(stage + 2, self.horizon + 1)])
 
 
 def row_weight(stage: int, horizon: int) -> float:
@@ -89,29 +126,47 @@ def row_weight(stage: int, horizon: int) -> float:
 def control_problem(controller: Controller) -> Problem:
     """Turn a controller into CasADi functions."""
     model, horizon, limits = controller.model, controller.horizon, controller.limits
-    nx, nu = len(model.states), len(model.inputs)
-    x, u, now = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("now", nx)
+    nx, nu, ng = len(model.states), len(model.inputs), len(controller.given)
+    # The state of the problem holds the last inputs that are read, too.
+    carried = controller.carried
+    nz = nx + len(carried)
+    z, u, now = ca.SX.sym("x", nz), ca.SX.sym("u", nu), ca.SX.sym("now", nz)
+    x, before = split(z, (nx, len(carried)))
+    estimate, _ = split(now, (nx, len(carried)))
     theta, setpoint = ca.SX.sym("theta", controller.theta.dimension), ca.SX.sym("setpoint", nx + nu)
     nominal = ca.SX.sym("p", model.nominal.size)
     memory, y = (ca.SX.sym(name, controller.estimation.size1_in(i)) for i, name in ((1, "memory"), (2, "y")))
+    given, given_end = ca.SX.sym("given", ng), ca.SX.sym("given_end", ng)
 
-    p = controller.parameters(theta, nominal)
-    after = model.f(x, u, p)
+    p = controller.parameters(theta, nominal, given)
+    ahead = model.f(x, u, p)
+    after = ca.vertcat(ahead, *(u[i] for i in carried))
     no_input = ca.SX(ca.DM.zeros(nu))
+    last = ca.SX(no_input)
+    for k, i in enumerate(carried):
+        last[i] = before[k]
 
-    def rows(places: tuple[str, ...], state: Any, control: Any) -> Any:
-        return ca.vertcat(*(limit.rows(state, control, theta, p, now) / limit.scale for limit in limits if limit.at in places))
+    def rows(places: tuple[str, ...], state: Any, control: Any, signals: Any) -> Any:
+        arguments = (state, control, theta, p, estimate, last, signals)
+        return ca.vertcat(*(limit.rows(*arguments) / limit.scale for limit in limits if limit.at in places))
 
+    lower, upper = (bound(theta, p, estimate, given) for bound in (controller.input_lower, controller.input_upper))
+    rate = controller.input_rate(theta, p, estimate, given)[list(controller.rated)] if controller.rated else ca.SX(0, 1)
     x_hat, corrected, predicted = controller.estimation(x, memory, y, u, p)
     expressions = [
         after,
-        controller.stage_cost(x, u, theta, p, setpoint, now),
-        ca.vertcat(rows(("start", "both"), x, u), rows(("end", "both"), after, u)),
-        controller.terminal_cost(x, no_input, theta, p, setpoint, now),
-        rows(("terminal",), x, no_input),
-        controller.input_lower(theta, p, now),
-        controller.input_upper(theta, p, now),
-        controller.fallback(theta, p, now),
+        controller.stage_cost(x, u, theta, p, setpoint, estimate, last, given),
+        ca.vertcat(
+            rows(("start", "both"), x, u, given),
+            rows(("end", "both"), ahead, u, given_end),
+            _rate_rows(controller, u, last, lower, upper, rate),
+        ),
+        controller.terminal_cost(x, no_input, theta, p, setpoint, estimate, last, given),
+        rows(("terminal",), x, no_input, given),
+        lower,
+        upper,
+        rate,
+        controller.fallback(theta, p, estimate, given),
         x_hat,
         corrected,
         predicted,
@@ -120,33 +175,90 @@ def control_problem(controller: Controller) -> Problem:
     # share has to be one beforehand: two symbols for one number are not recognised any more.
     found = ca.extract_parametric(_cse(*expressions), ca.vertcat(theta, setpoint, nominal), {"extract_trivial": True})
     expressions, symbols, values = found
-    q = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+    fixed = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
     prepared = ca.cse(ca.vertcat(*values)) if values else ca.SX(0, 1)
-    after, stage_cost, stage_rows, final_cost, final_rows, lower, upper, fallback, x_hat, corrected, predicted = expressions
+    after, stage_cost, stage_rows, final_cost, final_rows, lower, upper, rate, fallback, x_hat, corrected, predicted = expressions
+    q, window = ca.vertcat(fixed, given, given_end), _Window(fixed.shape[0], ng, horizon)
 
     weight = ca.SX.sym("weight")
     stage_rows = stage_rows * weight
     final_rows = final_rows * row_weight(horizon, horizon)
-    stage = _Linearisation.of(x, u, after, stage_cost, stage_rows)
-    final = _Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
-    groups = (*(_group(controller, "start", "both") + _group(controller, "end", "both")) * horizon, *_group(controller, "terminal"))
-    packed_stage = ca.Function("stage", [x, u, now, q, weight], _cse(after, stage_cost, stage_rows, stage.packed))
-    follow = ca.Function("follow", [x, u, q], _cse(after))
-    packed_final = ca.Function("final", [x, now, q], _cse(final_cost, final_rows, final.packed))
+    stage = _Linearisation.of(z, u, after, stage_cost, stage_rows)
+    final = _Linearisation.of(z, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
+    hard = [-1] * (2 * len(controller.rated))
+    groups = (
+        *(_group(controller, "start", "both") + _group(controller, "end", "both") + hard) * horizon,
+        *_group(controller, "terminal"),
+    )
+    packed_stage = ca.Function("stage", [z, u, now, q, weight], _cse(after, stage_cost, stage_rows, stage.packed))
+    follow = ca.Function("follow", [z, u, q], _cse(after))
+    packed_final = ca.Function("final", [z, now, q], _cse(final_cost, final_rows, final.packed))
+    bounds, clip = _bounds(controller, ca.Function("bound", [now, q], _cse(lower, upper, rate)), window)
+    # The measurement belongs to the end of the interval before.
+    correct = ca.Function("correct", [memory, y, u, q], _cse(x_hat, corrected))
+    predict = ca.Function("predict", [x, memory, u, q], _cse(predicted))
     return Problem(
         controller=controller,
         prepare=ca.Function("prepare", [theta, setpoint, nominal], [prepared]),
-        bounds=ca.Function("bounds", [now, q], [ca.repmat(lower, horizon, 1), ca.repmat(upper, horizon, 1)]),
-        sweep=_sweep(packed_stage, packed_final, horizon, nx, nu, q.shape[0]),
+        bounds=bounds,
+        clip=clip,
+        sweep=_sweep(packed_stage, packed_final, nz, nu, window),
         quadratic=_quadratic(controller, stage, final, groups),
-        curvature=_curvature(follow, _second(x, u, now, q, weight, after, stage_rows), stage, final, horizon),
+        curvature=_curvature(follow, _second(z, u, now, q, weight, after, stage_rows), stage, final, window),
         residual=_residual(controller, stage, final, groups),
         merit=_merit(controller, groups),
-        fallback=ca.Function("fallback", [now, q], [fallback]),
-        correct=ca.Function("correct", [memory, y, u, q], _cse(x_hat, corrected)),
-        predict=ca.Function("predict", [x, memory, u, q], _cse(predicted)),
+        fallback=_at_stage(ca.Function("fallback", [now, q], [fallback]), window, 0),
+        correct=_at_stage(correct, window, -1),
+        predict=_at_stage(predict, window, 0),
         groups=groups,
     )
+
+
+def _rate_rows(controller: Controller, u: Any, last: Any, lower: Any, upper: Any, rate: Any) -> Any:
+    """Rows that are <= 0 when the rates are kept, as shares of the inputs' ranges.
+
+    Where the bounds move away faster than the rate they win, so that an input that keeps these rows always exists.
+    """
+    own = list(controller.rated)
+    if not own:
+        return ca.SX(0, 1)
+    span = _span(lower, upper)[own]
+    above = u[own] - ca.fmax(last[own] + rate, lower[own])
+    below = ca.fmin(last[own] - rate, upper[own]) - u[own]
+    return ca.vertcat(above / span, below / span)
+
+
+def _at_stage(function: ca.Function, window: _Window, stage: int) -> ca.Function:
+    """A function whose last argument is what a stage reads of q, as one of the whole q."""
+    if not window.signals:
+        return function
+    *arguments, _ = function.mx_in()
+    q = ca.MX.sym("q", window.length)
+    return ca.Function(function.name(), [*arguments, q], list(function.call([*arguments, window.at(q, stage)])))
+
+
+def _bounds(controller: Controller, bound: ca.Function, window: _Window) -> tuple[ca.Function, ca.Function]:
+    """`Problem.bounds` and `Problem.clip` from (now, q of a stage) -> (lower, upper, rate)."""
+    horizon, nu, nz = controller.horizon, len(controller.model.inputs), bound.size1_in(0)
+    now, q, inputs = ca.MX.sym("now", nz), ca.MX.sym("q", window.length), ca.MX.sym("U", horizon * nu)
+    stages = [bound(now, window.at(q, i)) for i in range(horizon if window.signals else 1)] * (1 if window.signals else horizon)
+    nx = nz - len(controller.carried)
+    last = ca.MX.zeros(nu)
+    for k, i in enumerate(controller.carried):
+        last[i] = now[nx + k]
+    lowers, uppers, clipped = [], [], []
+    for i, (u, (low, high, rate)) in enumerate(zip(ca.vertsplit(inputs, nu), stages, strict=True)):
+        least, most = ca.MX(low), ca.MX(high)
+        for k, j in enumerate(controller.rated):
+            least[j] = ca.fmin(ca.fmax(low[j], last[j] - rate[k]), high[j])
+            most[j] = ca.fmax(ca.fmin(high[j], last[j] + rate[k]), low[j])
+        # From the second stage on the rate is a row of the problem: what the input may be depends on the one before.
+        lowers.append(least if i == 0 else low)
+        uppers.append(most if i == 0 else high)
+        last = ca.fmin(ca.fmax(u, least), most)
+        clipped.append(last)
+    bounds = ca.Function("bounds", [now, q], [ca.vertcat(*lowers), ca.vertcat(*uppers)])
+    return bounds, ca.Function("clip", [now, inputs, q], [ca.vertcat(*clipped)])
 
 
 def _cse(*expressions: Any) -> list[Any]:
@@ -187,24 +299,30 @@ class _Linearisation:
         return [ca.SX(pattern, piece) for pattern, piece in zip(self.patterns, pieces, strict=True)]
 
 
-def _sweep(stage: ca.Function, final: ca.Function, horizon: int, nx: int, nu: int, nq: int) -> ca.Function:
-    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", nq)
+def _sweep(stage: ca.Function, final: ca.Function, nx: int, nu: int, window: _Window) -> ca.Function:
+    horizon = window.horizon
+    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", window.length)
     x, cost, rows, derivatives = now, ca.MX(0.0), [], []
     for i, u in enumerate(ca.vertsplit(inputs, nu)):
-        x, stage_cost, row, packed = stage(x, u, now, q, row_weight(i, horizon))
+        x, stage_cost, row, packed = stage(x, u, now, window.at(q, i), row_weight(i, horizon))
         cost = cost + stage_cost
         rows.append(row)
         derivatives.append(packed)
-    final_cost, row, packed = final(x, now, q)
+    final_cost, row, packed = final(x, now, window.at(q, horizon))
     return ca.Function("sweep", [now, inputs, q], [cost + final_cost, ca.vertcat(*rows, row), ca.vertcat(*derivatives, packed)])
 
 
 def _violations(controller: Controller, groups: tuple[int, ...], rows: Any) -> list[Any]:
     """s_j / scale_j, the largest violation of each limit over the horizon, at least 0."""
     worst: list[Any] = [0.0] * len(controller.limits)
-    for i, j in enumerate(groups):
+    for i, j in _soft(groups):
         worst[j] = ca.if_else(rows[i] > worst[j], rows[i], worst[j])
     return worst
+
+
+def _soft(groups: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(row, limit) of the rows that have a slack."""
+    return [(i, j) for i, j in enumerate(groups) if j >= 0]
 
 
 def _merit(controller: Controller, groups: tuple[int, ...]) -> ca.Function:
@@ -238,8 +356,8 @@ def _second(x: Any, u: Any, now: Any, q: Any, weight: Any, after: Any, rows: Any
     return ca.Function("second", [x, u, now, q, weight, costate, multipliers], _cse(ca.fmax(bent, 0)))
 
 
-def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, final: _Linearisation, horizon: int) -> ca.Function:
-    nx, nu, nq, width = follow.size1_in(0), follow.size1_in(1), follow.size1_in(2), second.size1_in(6)
+def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, final: _Linearisation, window: _Window) -> ca.Function:
+    nx, nu, width, horizon = follow.size1_in(0), follow.size1_in(1), second.size1_in(6), window.horizon
     own, last = ca.SX.sym("D", stage.length), ca.SX.sym("D", final.length)
     ahead, mu, gamma = ca.SX.sym("costate", nx), ca.SX.sym("lambda", width), ca.SX.sym("gamma")
     f_x, _, c_x, _, l_x, *_ = stage.unpack(own)
@@ -256,7 +374,7 @@ def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, 
     ranges = [ca.diag(block) for block in _blocks(_span(low, high), nu)]
     scaled = ca.Function("scaling", [whole, low, high], _cse(_scaling(*_derivatives(whole, stage, final, horizon), ranges)))
 
-    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", nq)
+    now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", window.length)
     vector, multipliers = ca.MX.sym("D", whole.shape[0]), ca.MX.sym("lambda", horizon * width + final_x.shape[0])
     lower, upper = ca.MX.sym("lower", horizon * nu), ca.MX.sym("upper", horizon * nu)
     scaling = scaled(vector, lower, upper)
@@ -264,12 +382,12 @@ def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, 
     *derivatives, last_derivatives = split(vector, (*[stage.length] * horizon, final.length))
     *prices, last_price = split(multipliers, (*[width] * horizon, final_x.shape[0]))
     states = [now]
-    for u in controls[:-1]:
-        states.append(follow(states[-1], u, q))
+    for i, u in enumerate(controls[:-1]):
+        states.append(follow(states[-1], u, window.at(q, i)))
     costate = end(last_derivatives, last_price, scaling)
     out: list[Any] = []
     for i in reversed(range(horizon)):
-        out.insert(0, second(states[i], controls[i], now, q, row_weight(i, horizon), costate, prices[i]))
+        out.insert(0, second(states[i], controls[i], now, window.at(q, i), row_weight(i, horizon), costate, prices[i]))
         costate = back(derivatives[i], costate, prices[i], scaling)
     return ca.Function("curvature", [now, inputs, vector, multipliers, lower, upper, q], [ca.vertcat(*out)])
 
@@ -327,7 +445,7 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
 
     root = ca.sqrt(gamma * ca.vertcat(*(limit.penalty * limit.scale for limit in limits))) if limits else ca.SX(0, 1)
     slacks = ca.SX(size + len(groups), len(limits))
-    for i, j in enumerate(groups):
+    for i, j in _soft(groups):
         slacks[size + i, j] = -1 / root[j]
     data = [
         ca.vertcat(root, *gradient),
@@ -379,6 +497,7 @@ def _residual(controller: Controller, stage: _Linearisation, final: _Linearisati
         # Relative to the price, which is so large that its rounding alone would exceed the tolerance.
         spent = sum((multipliers[i] for i in own_rows), ca.SX(0)) / (gamma * limit.scale * limit.penalty)
         residuals.append(ca.fabs(_least(s, 1 + s - spent)))
+    residuals += [ca.fabs(_least(multipliers[i], -rows[i])) for i, group in enumerate(groups) if group < 0]
     everything = ca.vertcat(*residuals)
     worst: Any = 0.0
     for k in range(everything.shape[0]):

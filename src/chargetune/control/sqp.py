@@ -50,7 +50,7 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     U is finite and within the bounds whatever happened: status FALLBACK means that it is the fallback input repeated.
     kkt is `Problem.residual` at U. ``warm`` is U and the QP's multipliers; `cold` makes the first one.
     """
-    size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.prepare.size1_out(0), _duals(problem)
+    size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.sweep.size1_in(2), _duals(problem)
     step = _iteration(problem, qp)
     last_one = problem.controller.iterations_max - 1
     arguments = step.mx_in()[:-1]
@@ -69,15 +69,16 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
 
     now, warm, q = ca.MX.sym("now", nx), ca.MX.sym("warm", size + duals), ca.MX.sym("q", nq)
     # Bounds may depend on the estimate; they must stay numbers when it is not one.
-    known = ca.if_else(finite(ca.sum1(ca.fabs(now))), now, ca.DM.zeros(nx))
+    estimate, last_inputs = split(now, (nx - len(problem.controller.carried), len(problem.controller.carried)))
+    known = ca.vertcat(ca.if_else(finite(ca.sum1(ca.fabs(estimate))), estimate, ca.DM.zeros(estimate.shape[0])), last_inputs)
     lower, upper = problem.bounds(known, q)
     before, dual_before = split(warm, (size, duals))
-    start = ca.fmin(ca.fmax(before, lower), upper)
+    start = problem.clip(known, before, q)
     cost, rows, derivatives = problem.sweep(now, start, q)
     found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), dual_before, lower, upper, q)
     usable = finite(ca.sum1(ca.fabs(found)))
     declared = ca.repmat(problem.fallback(known, q), problem.controller.horizon, 1)
-    bounded = ca.fmin(ca.fmax(ca.if_else(usable, found, declared), lower), upper)
+    bounded = problem.clip(known, ca.if_else(usable, found, declared), q)
     status = ca.if_else(usable, ca.if_else(kkt <= KKT_TOLERANCE, SolveStatus.CONVERGED, SolveStatus.NOT_CONVERGED), SolveStatus.FALLBACK)
     usable_dual = ca.if_else(finite(ca.sum1(ca.fabs(dual))), dual, ca.DM.zeros(duals))
     following = ca.vertcat(bounded, usable_dual)[_shift(problem)]
@@ -113,7 +114,7 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     With ``bend`` = 1 it takes the curvature of constraints and dynamics into account, with 0 it is Gauss-Newton's.
     """
     limits = problem.controller.limits
-    nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
+    nx, nq, rows = problem.sweep.size1_in(0), problem.sweep.size1_in(2), len(problem.groups)
     now, inputs, c, derivatives = (
         ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2)))
     )
@@ -147,7 +148,7 @@ def _line_search(problem: Problem) -> ca.Function:
         "d": problem.size,
         "length": 1,
         "allowed": 1,
-        "q": problem.prepare.size1_out(0),
+        "q": problem.sweep.size1_in(2),
     }
     arguments = [ca.MX.sym(name, rows) for name, rows in sizes.items()]
     now, base, direction, length, allowed, q = arguments

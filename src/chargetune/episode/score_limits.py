@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score, in_tolerances
+from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Evaluation", "ScoredLimit", "Windows", "limit_samples", "moving_mean", "score_limits", "violation", "worst_by_window"]
 
@@ -47,13 +48,13 @@ class ScoredLimit:
             raise ValueError(f"limit {self.name}: neither lower nor upper is given")
         for field in ("lower", "upper", "tolerance"):
             value = getattr(self, field)
-            if value is not None and not _finite(value):
+            if value is not None and not is_finite(value):
                 raise ValueError(f"limit {self.name}: {field} = {value!r}, allowed is a finite number")
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise ValueError(f"limit {self.name}: lower = {self.lower} must be less than upper = {self.upper}")
         if self.tolerance < 0:
             raise ValueError(f"limit {self.name}: tolerance = {self.tolerance!r}, allowed is >= 0")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
+        if not is_integer(self.samples) or self.samples < 1:
             raise ValueError(f"limit {self.name}: samples = {self.samples!r}, allowed is an integer >= 1")
 
     def excess(self, episode: Episode) -> NDArray[np.float64]:
@@ -82,9 +83,9 @@ class Windows:
     count: int
 
     def __post_init__(self) -> None:
-        if not (_finite(self.lower) and _finite(self.upper) and self.lower < self.upper):
+        if not (is_finite(self.lower) and is_finite(self.upper) and self.lower < self.upper):
             raise ValueError(f"windows of {self.signal}: [{self.lower!r}, {self.upper!r}], allowed are finite numbers, the first one less")
-        if isinstance(self.count, bool) or not isinstance(self.count, int) or self.count < 1:
+        if not is_integer(self.count) or self.count < 1:
             raise ValueError(f"windows of {self.signal}: count = {self.count!r}, allowed is an integer >= 1")
 
     def of(self, episode: Episode) -> NDArray[np.int_]:
@@ -215,7 +216,3 @@ def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64
 
 def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float64)
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

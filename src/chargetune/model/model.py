@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.runtime.numeric import is_finite
 from chargetune.runtime.split import split
 
 __all__ = ["Model", "Named", "Signal"]
@@ -172,4 +173,4 @@ def _stack(values: Mapping[str, Any], signals: Sequence[Signal], where: str) -> 
 
 
 def _positive(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    return is_finite(value) and value > 0  # type: ignore[operator]
