@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.convexity import refuse_nonconvex
+from chargetune.control.convexity import Curvature, curvature_of
 from chargetune.control.estimators import Estimator, ExactState
 from chargetune.control.limits import Bound, LimitRows, SoftLimit
 from chargetune.control.stage import Expression, Stage, Symbols
@@ -24,6 +24,7 @@ from chargetune.runtime.numeric import is_finite, is_integer
 __all__ = ["Controller", "LimitRows", "SoftLimit", "Stage"]
 
 HORIZON_MAX = 50
+Hessian = Literal["gauss_newton", "exact"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Controller:
     given: tuple[Signal, ...] = ()
     estimator: Estimator = field(default_factory=ExactState)
     iterations_max: int = 20
+    hessian: Hessian = "gauss_newton"
 
     @classmethod
     def build(
@@ -86,6 +88,7 @@ class Controller:
         input_before: Mapping[str, float] | None = None,
         estimator: Estimator | None = None,
         iterations_max: int = 20,
+        hessian: Hessian | None = None,
     ) -> Controller:
         """Make a controller from Python functions of a `Stage`.
 
@@ -95,6 +98,8 @@ class Controller:
         """
         if not is_integer(horizon) or not 1 <= horizon <= HORIZON_MAX:
             raise ValueError(f"controller: horizon = {horizon!r}, allowed is an integer in [1, {HORIZON_MAX}]")
+        if hessian not in (None, "gauss_newton", "exact"):
+            raise ValueError(f"controller: hessian = {hessian!r}, allowed is gauss_newton, exact or None")
         if not is_integer(iterations_max) or iterations_max < 1:
             raise ValueError(f"controller: iterations_max = {iterations_max!r}, allowed is an integer >= 1")
         named = [signal.name for signal in given]
@@ -135,9 +140,20 @@ class Controller:
             estimator=estimator or ExactState(),
             iterations_max=int(iterations_max),
         )
-        for label, cost in (("stage_cost", built.stage_cost), ("terminal_cost", built.terminal_cost)):
-            refuse_nonconvex(label, cost, model, theta, wanted, begin)
-        return built
+        return replace(built, hessian=hessian or built._suitable_hessian)
+
+    @cached_property
+    def curvatures(self) -> dict[str, Curvature]:
+        """The least and the largest curvature that was found of the costs."""
+        arguments = (self.model, self.theta, self.setpoint, self.start)
+        costs = {"stage_cost": self.stage_cost, "terminal_cost": self.terminal_cost}
+        return {label: curvature_of(cost, *arguments) for label, cost in costs.items()}
+
+    @property
+    def _suitable_hessian(self) -> Hessian:
+        found = self.curvatures.values()
+        convex = all(one.convex for one in found)
+        return "gauss_newton" if convex and any(one.largest > 0 for one in found) else "exact"
 
     @property
     def given_names(self) -> tuple[str, ...]:
@@ -176,7 +192,16 @@ class Controller:
         ]  # fmt: skip
         limits = [(limit.of, limit.at, limit.penalty, limit.scale) for limit in self.limits]
         names = [self.model.state_names, self.model.input_names, self.model.output_names, self.model.sampling_time_s]
-        sizes = [self.theta.dimension, self.horizon, self.iterations_max, *names, self.model.parameter_blocks, self.rated, self.given_names]
+        sizes = [
+            self.theta.dimension,
+            self.horizon,
+            self.iterations_max,
+            *names,
+            self.model.parameter_blocks,
+            self.rated,
+            self.given_names,
+            self.hessian,
+        ]
         content = pickle.dumps(([f.serialize() for f in functions], limits, sizes))
         return hashlib.sha256(content).hexdigest()
 

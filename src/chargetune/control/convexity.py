@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -10,10 +11,27 @@ import numpy as np
 from chargetune.model.model import Model
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["reached_states", "refuse_nonconvex"]
+__all__ = ["Curvature", "curvature_of", "reached_states"]
 
 # Random points at which the curvature is looked at, beside start and set-point.
 POINTS = 8
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """Least and largest eigenvalue of a cost's Hessian over the points looked at.
+
+    ``of``: what the Hessian is taken of, the inputs and the states that they reach; ``along``: those that the least one points to.
+    """
+
+    least: float
+    largest: float
+    of: tuple[str, ...]
+    along: tuple[str, ...]
+
+    @property
+    def convex(self) -> bool:
+        return self.least >= -1e-9 * (1.0 + self.largest)
 
 
 def reached_states(model: Model) -> tuple[int, ...]:
@@ -28,20 +46,17 @@ def reached_states(model: Model) -> tuple[int, ...]:
         reached |= more
 
 
-def refuse_nonconvex(
-    label: str, cost: ca.Function, model: Model, theta: ParameterSpace, setpoint: Sequence[float], start: Sequence[float]
-) -> None:
-    """ValueError where a cost (x, u, theta, p, setpoint, now, u_last, given) is bent downwards in u, u_last and the states that u reaches.
+def curvature_of(cost: ca.Function, model: Model, theta: ParameterSpace, setpoint: Sequence[float], start: Sequence[float]) -> Curvature:
+    """The curvature of a cost (x, u, theta, p, setpoint, now, u_last, given) in u, u_last and the states that u reaches.
 
-    Looked at are start, set-point and random points; the others are no choice of the controller's.
+    Looked at are start, set-point and random points; the other states are no choice of the controller's.
     """
     x, u, *others, last, given = cost.sx_in()
     reached = reached_states(model)
-    names = [f"x[{model.state_names[i]}]" for i in reached]
-    names += [*(f"u[{n}]" for n in model.input_names), *(f"u_last[{n}]" for n in model.input_names)]
-    free = ca.vertcat(*(x[i] for i in reached), u, last)
-    value = cost(x, u, *others, last, given)
-    curvature = ca.Function("curvature", [x, u, *others, last, given], [ca.hessian(value, free)[0]])
+    names = [*model.input_names, *(f"{n} before" for n in model.input_names), *(model.state_names[i] for i in reached)]
+    free = ca.vertcat(u, last, *(x[i] for i in reached))
+    hessian = ca.hessian(cost(x, u, *others, last, given), free)[0]
+    evaluate = ca.Function("curvature", [x, u, *others, last, given], [hessian])
     draw, nx = np.random.default_rng(0), len(start)
     default, wanted, size = theta.default, np.array(setpoint), len(setpoint)
     begin = np.array(start)
@@ -49,15 +64,16 @@ def refuse_nonconvex(
     for _ in range(POINTS):
         point = draw.uniform(theta.lower, theta.upper) if default.size else default
         places.append((draw.uniform(-1.0, 1.0, size), point, draw.uniform(-1.0, 1.0, nx)))
+    least, largest = 0.0, 0.0
+    along: tuple[str, ...] = ()
     for xu, at, now in places:
         signals = draw.uniform(-1.0, 1.0, given.shape[0])
-        matrix = np.array(curvature(xu[:nx], xu[nx:], at, model.nominal, wanted, now, xu[nx:], signals))
-        if not np.all(np.isfinite(matrix)):
+        matrix = np.array(evaluate(xu[:nx], xu[nx:], at, model.nominal, wanted, now, xu[nx:], signals))
+        if not matrix.size or not np.all(np.isfinite(matrix)):
             continue
         values, vectors = np.linalg.eigh(matrix)
-        if values[0] < -1e-9 * (1.0 + abs(values[-1])):
-            bent = [name for name, share in zip(names, np.abs(vectors[:, 0]), strict=True) if share > 0.1]
-            raise ValueError(
-                f"controller: {label} has curvature {values[0]:.3g} in ({', '.join(bent)}), allowed is a convex function (curvature >= 0) "
-                f"of the inputs and of the states that they reach, {', '.join(names[: len(reached)]) or 'none'}"
-            )
+        largest = max(largest, float(values[-1]))
+        if values[0] < least:
+            least = float(values[0])
+            along = tuple(name for name, share in zip(names, np.abs(vectors[:, 0]), strict=True) if share > 0.1)
+    return Curvature(least, largest, tuple(names), along)

@@ -22,6 +22,11 @@ __all__ = ["Problem", "control_problem", "row_weight"]
 
 # Least curvature of an input relative to the mean; only the steps depend on it, not the solution.
 REGULARISATION = 1e-8
+# A cost whose mean curvature is below this share of its mean slope (both over an input's range) is flat: a proximal term of that size
+# stands in for its curvature, so that a step over the whole range costs a twenty-thousandth of what it gains.
+FLAT = 1e-4
+# Least curvature that stands in for a negative one.
+LEAST_PIVOT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -39,13 +44,16 @@ class Problem:
         (now, U, q) -> the inputs nearest to U, one after the other, that keep bounds and rates.
     sweep
         (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
+    scaling
+        (D, lower, upper) -> gamma, with which the mean of the scaled Hessian's diagonal is one, or less where the cost has
+        hardly a curvature.
     quadratic
-        (U, c, D, lower, upper, W) -> (g, A', lba, uba, span, gamma): the QP of `control.qp`, one slack a limit. Its first
-        N nu rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J, and W, shape (N nu,),
-        is added to the diagonal of the stages' input Hessians.
+        (U, c, D, lower, upper, gamma) -> (g, A', lba, uba, span): the QP of `control.qp`, one slack a limit. Its first
+        N nu rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J.
     curvature
-        (now, U, D, multipliers, lower, upper, q) -> W: what constraints and dynamics add to that diagonal in the
-        Lagrangian, where it is positive.
+        (now, U, D, multipliers, q) -> D with the Lagrangian's curvature in the Hessians: of a Gauss-Newton controller what
+        constraints and dynamics add to the diagonal of the inputs' one, where it is positive; of an exact one all of it.
+        The multipliers are those of the rows, of the cost as it is (gamma = 1).
     residual
         (U, c, D, multipliers, gamma, lower, upper) -> largest natural residual of the scaled optimality conditions.
     merit
@@ -63,6 +71,7 @@ class Problem:
     bounds: ca.Function
     clip: ca.Function
     sweep: ca.Function
+    scaling: ca.Function
     quadratic: ca.Function
     curvature: ca.Function
     residual: ca.Function
@@ -183,8 +192,12 @@ def control_problem(controller: Controller) -> Problem:
     weight = ca.SX.sym("weight")
     stage_rows = stage_rows * weight
     final_rows = final_rows * row_weight(horizon, horizon)
-    stage = _Linearisation.of(z, u, after, stage_cost, stage_rows)
-    final = _Linearisation.of(z, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
+    exact, nothing = controller.hessian == "exact", ca.SX(0, 1)
+    bend, bend_final = _Bend.of(z, u, after, stage_rows, exact=exact), _Bend.of(z, nothing, nothing, final_rows, exact=exact)
+    stage = _Linearisation.of(z, u, after, stage_cost, stage_rows, bend)
+    final = _Linearisation.of(z, nothing, nothing, final_cost, final_rows, bend_final)
+    second = ca.Function("second", [z, u, now, q, weight, bend.costate, bend.multipliers], _cse(stage.bent(bend)))
+    second_final = ca.Function("second_final", [z, now, q, bend_final.multipliers], _cse(final.bent(bend_final)))
     hard = [-1] * (2 * len(controller.rated))
     groups = (
         *(_group(controller, "start", "both") + _group(controller, "end", "both") + hard) * horizon,
@@ -203,8 +216,9 @@ def control_problem(controller: Controller) -> Problem:
         bounds=bounds,
         clip=clip,
         sweep=_sweep(packed_stage, packed_final, nz, nu, window),
+        scaling=_scaling(controller, stage, final),
         quadratic=_quadratic(controller, stage, final, groups),
-        curvature=_curvature(follow, _second(z, u, now, q, weight, after, stage_rows), stage, final, window),
+        curvature=_curvature(follow, second, second_final, stage, final, window),
         residual=_residual(controller, stage, final, groups),
         merit=_merit(controller, groups),
         fallback=_at_stage(ca.Function("fallback", [now, q], [fallback]), window, 0),
@@ -270,6 +284,25 @@ def _group(controller: Controller, *places: str) -> list[int]:
 
 
 @dataclass(frozen=True)
+class _Bend:
+    """Second derivatives of costate' f + multipliers' c with respect to (x, u), as far as the solver uses them."""
+
+    costate: Any
+    multipliers: Any
+    hessian: Any
+
+    @classmethod
+    def of(cls, x: Any, u: Any, after: Any, rows: Any, *, exact: bool) -> _Bend:
+        costate, multipliers = ca.SX.sym("costate", after.shape[0]), ca.SX.sym("lambda", rows.shape[0])
+        total = ca.dot(costate, after) + ca.dot(multipliers, rows)
+        if exact:
+            return cls(costate, multipliers, ca.sparsify(ca.hessian(total, ca.vertcat(x, u))[0]))
+        positive = ca.fmax(ca.diag(ca.densify(ca.hessian(total, u)[0])), 0)
+        nx, nu = x.shape[0], u.shape[0]
+        return cls(costate, multipliers, ca.diagcat(ca.SX(nx, nx), ca.diag(positive)) if nu else ca.SX(nx, nx))
+
+
+@dataclass(frozen=True)
 class _Linearisation:
     """Derivatives of one stage with respect to (x, u), as the non-zeros of sparse matrices packed in one vector."""
 
@@ -277,17 +310,24 @@ class _Linearisation:
     patterns: tuple[ca.Sparsity, ...]
 
     @classmethod
-    def of(cls, x: Any, u: Any, after: Any, cost: Any, rows: Any) -> _Linearisation:
+    def of(cls, x: Any, u: Any, after: Any, cost: Any, rows: Any, bend: _Bend) -> _Linearisation:
+        """The Hessians' patterns have room for what ``bend`` adds later."""
         xu = ca.vertcat(x, u)
         curvature, slope = ca.hessian(cost, xu)
         nx = x.shape[0]
         slope_x, slope_u = split(slope, (nx, u.shape[0]))
-        parts = [
-            ca.jacobian(after, x), ca.jacobian(after, u), ca.jacobian(rows, x), ca.jacobian(rows, u),
-            slope_x, slope_u, curvature[:nx, :nx], curvature[nx:, :nx], curvature[nx:, nx:],
-        ]  # fmt: skip
+        parts = [ca.jacobian(after, x), ca.jacobian(after, u), ca.jacobian(rows, x), ca.jacobian(rows, u), slope_x, slope_u]
         parts = [ca.sparsify(part) for part in parts]
+        pairs = zip(_hessians(ca.sparsify(curvature), nx), _hessians(bend.hessian, nx), strict=True)
+        parts += [ca.project(one, one.sparsity() + two.sparsity()) for one, two in pairs]
         return cls(ca.vertcat(*(ca.vertcat(*part.nonzeros()) for part in parts)), tuple(part.sparsity() for part in parts))
+
+    def bent(self, bend: _Bend) -> Any:
+        """What ``bend`` adds to the packed vector."""
+        nx = self.patterns[6].size1()
+        parts = [ca.project(one, pattern) for one, pattern in zip(_hessians(bend.hessian, nx), self.patterns[6:], strict=True)]
+        kept = ca.SX(ca.DM.zeros(sum(pattern.nnz() for pattern in self.patterns[:6])))
+        return ca.vertcat(kept, *(ca.vertcat(*part.nonzeros()) for part in parts))
 
     @property
     def length(self) -> int:
@@ -297,6 +337,11 @@ class _Linearisation:
         """[f_x, f_u, c_x, c_u, l_x, l_u, l_xx, l_ux, l_uu] from the packed vector."""
         pieces = split(vector, (pattern.nnz() for pattern in self.patterns))
         return [ca.SX(pattern, piece) for pattern, piece in zip(self.patterns, pieces, strict=True)]
+
+
+def _hessians(matrix: Any, nx: int) -> list[Any]:
+    """[xx, ux, uu] of the Hessian with respect to (x, u)."""
+    return [matrix[:nx, :nx], matrix[nx:, :nx], matrix[nx:, nx:]]
 
 
 def _sweep(stage: ca.Function, final: ca.Function, nx: int, nu: int, window: _Window) -> ca.Function:
@@ -348,48 +393,34 @@ def _derivatives(vector: Any, stage: _Linearisation, final: _Linearisation, hori
     return [stage.unpack(one) for one in stages], final.unpack(last)
 
 
-def _second(x: Any, u: Any, now: Any, q: Any, weight: Any, after: Any, rows: Any) -> ca.Function:
-    """(x, u, now, q, weight, costate, multipliers) -> positive part of the diagonal of d2/du2 (costate' f + multipliers' c)."""
-    costate, multipliers = ca.SX.sym("costate", after.shape[0]), ca.SX.sym("lambda", rows.shape[0])
-    total = ca.dot(costate, after) + ca.dot(multipliers, rows)
-    bent = ca.diag(ca.densify(ca.hessian(total, u)[0]))
-    return ca.Function("second", [x, u, now, q, weight, costate, multipliers], _cse(ca.fmax(bent, 0)))
-
-
-def _curvature(follow: ca.Function, second: ca.Function, stage: _Linearisation, final: _Linearisation, window: _Window) -> ca.Function:
+def _curvature(
+    follow: ca.Function, second: ca.Function, second_final: ca.Function, stage: _Linearisation, final: _Linearisation, window: _Window
+) -> ca.Function:
     nx, nu, width, horizon = follow.size1_in(0), follow.size1_in(1), second.size1_in(6), window.horizon
     own, last = ca.SX.sym("D", stage.length), ca.SX.sym("D", final.length)
-    ahead, mu, gamma = ca.SX.sym("costate", nx), ca.SX.sym("lambda", width), ca.SX.sym("gamma")
+    ahead, mu = ca.SX.sym("costate", nx), ca.SX.sym("lambda", width)
     f_x, _, c_x, _, l_x, *_ = stage.unpack(own)
     *_, final_x, _, final_slope, _, _, _, _ = final.unpack(last)
     mu_last = ca.SX.sym("lambda", final_x.shape[0])
-    back = ca.Function("back", [own, ahead, mu, gamma], _cse(gamma * l_x + ca.mtimes(c_x.T, mu) + ca.mtimes(f_x.T, ahead)))
-    end = ca.Function("end", [last, mu_last, gamma], _cse(gamma * final_slope + ca.mtimes(final_x.T, mu_last)))
-
-    low, high, whole = (
-        ca.SX.sym("lower", horizon * nu),
-        ca.SX.sym("upper", horizon * nu),
-        ca.SX.sym("D", horizon * stage.length + final.length),
-    )
-    ranges = [ca.diag(block) for block in _blocks(_span(low, high), nu)]
-    scaled = ca.Function("scaling", [whole, low, high], _cse(_scaling(*_derivatives(whole, stage, final, horizon), ranges)))
+    back = ca.Function("back", [own, ahead, mu], _cse(l_x + ca.mtimes(c_x.T, mu) + ca.mtimes(f_x.T, ahead)))
+    end = ca.Function("end", [last, mu_last], _cse(final_slope + ca.mtimes(final_x.T, mu_last)))
 
     now, inputs, q = ca.MX.sym("now", nx), ca.MX.sym("U", horizon * nu), ca.MX.sym("q", window.length)
-    vector, multipliers = ca.MX.sym("D", whole.shape[0]), ca.MX.sym("lambda", horizon * width + final_x.shape[0])
-    lower, upper = ca.MX.sym("lower", horizon * nu), ca.MX.sym("upper", horizon * nu)
-    scaling = scaled(vector, lower, upper)
+    vector = ca.MX.sym("D", horizon * stage.length + final.length)
+    multipliers = ca.MX.sym("lambda", horizon * width + final_x.shape[0])
     controls = split(inputs, [nu] * horizon)
     *derivatives, last_derivatives = split(vector, (*[stage.length] * horizon, final.length))
     *prices, last_price = split(multipliers, (*[width] * horizon, final_x.shape[0]))
     states = [now]
-    for i, u in enumerate(controls[:-1]):
+    for i, u in enumerate(controls):
         states.append(follow(states[-1], u, window.at(q, i)))
-    costate = end(last_derivatives, last_price, scaling)
-    out: list[Any] = []
+    costate = end(last_derivatives, last_price)
+    out: list[Any] = [last_derivatives + second_final(states[-1], now, window.at(q, horizon), last_price)]
     for i in reversed(range(horizon)):
-        out.insert(0, second(states[i], controls[i], now, window.at(q, i), row_weight(i, horizon), costate, prices[i]))
-        costate = back(derivatives[i], costate, prices[i], scaling)
-    return ca.Function("curvature", [now, inputs, vector, multipliers, lower, upper, q], [ca.vertcat(*out)])
+        bent = second(states[i], controls[i], now, window.at(q, i), row_weight(i, horizon), costate, prices[i])
+        out.insert(0, derivatives[i] + bent)
+        costate = back(derivatives[i], costate, prices[i])
+    return ca.Function("curvature", [now, inputs, vector, multipliers, q], [ca.vertcat(*out)])
 
 
 def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:
@@ -407,18 +438,19 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
     size = horizon * nu
     inputs, lower, upper = (ca.SX.sym(n, size) for n in ("U", "lower", "upper"))
     rows, vector = ca.SX.sym("c", len(groups)), ca.SX.sym("D", horizon * stage.length + final.length)
+    gamma = ca.SX.sym("gamma")
     stages, last = _derivatives(vector, stage, final, horizon)
-    span, bent = _span(lower, upper), ca.SX.sym("W", size)
-    ranges, bends = ([ca.diag(block) for block in _blocks(vector, nu)] for vector in (span, bent))
-    gamma = _scaling(stages, last, ranges)
+    span = _span(lower, upper)
+    ranges = [ca.diag(block) for block in _blocks(span, nu)]
+    near = _proximal(gamma, *_steepness(stages, last, ranges))
     costate, weight = gamma * last[4], gamma * last[6]
     gradient: list[Any] = []
     laws: list[tuple[Any, Any]] = []
-    for scale, bend, (f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu) in zip(reversed(ranges), reversed(bends), reversed(stages), strict=True):
+    for scale, (f_x, f_u, _, _, l_x, l_u, l_xx, l_ux, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
         into = ca.mtimes(f_u, scale)
         ahead = ca.mtimes(into.T, weight)
-        block = ca.mtimes([scale, gamma * l_uu + bend, scale]) + ca.mtimes(ahead, into) + REGULARISATION * ca.SX.eye(nu)
-        inverse = ca.solve(ca.chol(ca.densify(block)), ca.SX.eye(nu))
+        block = ca.mtimes([scale, gamma * l_uu, scale]) + ca.mtimes(ahead, into) + (REGULARISATION + near) * ca.SX.eye(nu)
+        inverse = ca.solve(_factor(ca.densify(block)), ca.SX.eye(nu))
         law = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_ux) + ca.mtimes(ahead, f_x))
         slope = ca.mtimes(inverse.T, gamma * ca.mtimes(scale, l_u) + ca.mtimes(into.T, costate))
         costate = gamma * l_x + ca.mtimes(f_x.T, costate) - ca.mtimes(law.T, slope)
@@ -453,18 +485,52 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
         ca.vertcat((lower - inputs) / span, ca.SX(ca.DM(np.full(len(groups), -np.inf)))),
         ca.vertcat((upper - inputs) / span, -rows),
         span,
-        gamma,
     ]
-    return ca.Function("quadratic", [inputs, rows, vector, lower, upper, bent], _cse(*data))
+    return ca.Function("quadratic", [inputs, rows, vector, lower, upper, gamma], _cse(*data))
 
 
-def _scaling(stages: list[list[Any]], last: list[Any], ranges: list[Any]) -> Any:
-    """gamma, with which the mean of the scaled Hessian's diagonal is one."""
-    weight, total = last[6], ca.SX(0)
-    for scale, (f_x, f_u, _, _, _, _, l_xx, _, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
+def _factor(block: Any) -> Any:
+    """Upper triangular r with r'r = block; where the block is not positive definite a pivot is taken as if it were bent upwards."""
+    size = block.shape[0]
+    r, rest = ca.SX(size, size), ca.SX(block)
+    for k in range(size):
+        pivot = rest[k, k]
+        pivot = ca.sqrt(ca.if_else(pivot >= REGULARISATION, pivot, ca.fmax(-pivot, LEAST_PIVOT)))
+        r[k, k] = pivot
+        for j in range(k + 1, size):
+            r[k, j] = rest[k, j] / pivot
+        for i in range(k + 1, size):
+            for j in range(k + 1, size):
+                rest[i, j] -= r[k, i] * r[k, j]
+    return ca.triu(r)
+
+
+def _scaling(controller: Controller, stage: _Linearisation, final: _Linearisation) -> ca.Function:
+    """(D, lower, upper) -> gamma = 1 / max(mean of the scaled Hessian's diagonal, FLAT times that of the scaled gradient)."""
+    horizon, nu = controller.horizon, len(controller.model.inputs)
+    lower, upper = (ca.SX.sym(n, horizon * nu) for n in ("lower", "upper"))
+    vector = ca.SX.sym("D", horizon * stage.length + final.length)
+    ranges = [ca.diag(block) for block in _blocks(_span(lower, upper), nu)]
+    curvature, steep = _steepness(*_derivatives(vector, stage, final, horizon), ranges)
+    gamma = 1 / ca.fmax(ca.fmax(curvature, FLAT * steep), 1e-12)
+    return ca.Function("scaling", [vector, lower, upper], _cse(gamma))
+
+
+def _proximal(gamma: Any, curvature: Any, steep: Any) -> Any:
+    """The proximal term that takes the place of a curvature that is missing: nothing where the mean curvature is not flat."""
+    return ca.if_else(curvature < FLAT * steep, 1 - gamma * ca.fmax(curvature, 0), 0)
+
+
+def _steepness(stages: list[list[Any]], last: list[Any], ranges: list[Any]) -> tuple[Any, Any]:
+    """Means over the inputs of the scaled Hessian's diagonal and of the scaled gradient's size."""
+    costate, weight, total, steep = last[4], last[6], ca.SX(0), ca.SX(0)
+    for scale, (f_x, f_u, _, _, l_x, l_u, l_xx, _, l_uu) in zip(reversed(ranges), reversed(stages), strict=True):
         total += ca.trace(ca.densify(ca.mtimes([scale, l_uu + ca.mtimes([f_u.T, weight, f_u]), scale])))
+        steep += ca.sum1(ca.fabs(ca.mtimes(scale, l_u + ca.mtimes(f_u.T, costate))))
         weight = l_xx + ca.mtimes([f_x.T, weight, f_x])
-    return 1 / ca.fmax(total / sum(scale.shape[0] for scale in ranges), 1e-12)
+        costate = l_x + ca.mtimes(f_x.T, costate)
+    count = sum(scale.shape[0] for scale in ranges)
+    return total / count, steep / count
 
 
 def _residual(controller: Controller, stage: _Linearisation, final: _Linearisation, groups: tuple[int, ...]) -> ca.Function:

@@ -53,12 +53,13 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.sweep.size1_in(2), _duals(problem)
     step = _iteration(problem, qp)
     last_one = problem.controller.iterations_max - 1
+    curved_from = 0 if problem.controller.hessian == "exact" else CURVED_FROM
     arguments = step.mx_in()[:-1]
-    *point, dual, kkt = step(*arguments, float(last_one >= CURVED_FROM))
+    *point, dual, kkt = step(*arguments, float(last_one >= curved_from))
     # Further iterations are nested branches, which cost nothing where the first iterate is a solution.
     more = ca.Function("more", arguments, [point[0], dual, kkt, ca.MX(1.0)])
     for iteration in reversed(range(last_one)):
-        *point, dual, kkt = step(*arguments, float(iteration >= CURVED_FROM))
+        *point, dual, kkt = step(*arguments, float(iteration >= curved_from))
         inputs = more.mx_in()
         done = ca.Function("done", inputs, [inputs[1], inputs[5], ca.MX(0.0), ca.MX(0.0)])
         # A NaN is not converged either, hence the negation.
@@ -122,13 +123,14 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
     bend = ca.MX.sym("bend")
     of = problem.curvature.mx_in()
-    straight = ca.Function("straight", of, [ca.DM.zeros(problem.size)])
+    straight = ca.Function("straight", of, [of[2]])
     curvature = ca.Function.if_else("curvature", problem.curvature, straight)
-    # Multipliers: of the slacks' bounds, of the inputs' bounds, of the rows.
+    # Multipliers, of the cost as it is: of the slacks' bounds, of the inputs' bounds, of the rows.
     sizes = (len(limits) + problem.size, rows)
     _, prices = split(dual, sizes)
-    bent = curvature(bend, now, inputs, derivatives, prices, lower, upper, q)
-    *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper, bent)
+    bent = curvature(bend, now, inputs, derivatives, prices, q)
+    gamma = problem.scaling(bent if problem.controller.hessian == "exact" else derivatives, lower, upper)
+    *data, span = problem.quadratic(inputs, c, bent, lower, upper, gamma)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
@@ -137,7 +139,7 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     point = list(_line_search(problem)(now, inputs, span * direction, 1.0, allowed, q))
     _, prices = split(new_dual, sizes)
     kkt = problem.residual(*point[:3], prices, gamma, lower, upper)
-    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual, kkt])
+    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual / gamma, kkt])
 
 
 def _line_search(problem: Problem) -> ca.Function:
