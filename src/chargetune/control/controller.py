@@ -25,6 +25,8 @@ __all__ = ["Controller", "LimitRows", "SoftLimit", "Stage"]
 
 HORIZON_MAX = 50
 Hessian = Literal["gauss_newton", "exact"]
+Solver = Literal["sqp", "ipopt"]
+FirstGuess = Literal["cold", "ipopt"]
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,8 @@ class Controller:
         min  sum_{i<N} l(x_i, u_i) + Vf(x_N) + sum of penalties
         s.t. x_{i+1} = f(x_i, u_i), x_0 = estimate, input_lower <= u_i <= input_upper, limits on outputs and states
 
-    Inputs are bounded hard, everything else softly, so the problem always has a solution. l and Vf are to be convex
-    in u and the states that it reaches (their Hessians are the curvature of the Gauss-Newton model). Build one with
-    `Controller.build`. ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement,
+    Inputs are bounded hard, everything else softly, so the problem always has a solution. Build one with `Controller.build`.
+    ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement,
     ``input_before`` the input before the first interval, ``fallback`` the input applied when the solver fails, within the
     input bounds by clipping. ``given`` are signals whose values over the horizon are told at run time (`model.given`).
 
@@ -45,6 +46,12 @@ class Controller:
         min(u_{i-1} - rate, upper_i) <= u_i <= max(u_{i-1} + rate, lower_i)
 
     so that where bounds leave no input within the rate the bounds win.
+
+    ``hessian``: with "gauss_newton" the costs' Hessians are the curvature of the problem, which has to be convex in the inputs
+    and the states that they reach; with "exact" it is the Lagrangian's, made convex where it is not, for costs that are flat (economic
+    ones) or bent downwards. `build` chooses by `curvatures`. Of a problem that is not convex the solver finds a local
+    solution: the one downhill of its ``first_guess``, which is the repeated last input, or the plan that IPOPT finds from ``start``.
+    ``solver`` = "ipopt" leaves every solve to IPOPT, step by step only.
     """
 
     model: Model
@@ -66,6 +73,8 @@ class Controller:
     estimator: Estimator = field(default_factory=ExactState)
     iterations_max: int = 20
     hessian: Hessian = "gauss_newton"
+    solver: Solver = "sqp"
+    first_guess: FirstGuess = "cold"
 
     @classmethod
     def build(
@@ -89,6 +98,8 @@ class Controller:
         estimator: Estimator | None = None,
         iterations_max: int = 20,
         hessian: Hessian | None = None,
+        solver: Solver = "sqp",
+        first_guess: FirstGuess = "cold",
     ) -> Controller:
         """Make a controller from Python functions of a `Stage`.
 
@@ -98,8 +109,14 @@ class Controller:
         """
         if not is_integer(horizon) or not 1 <= horizon <= HORIZON_MAX:
             raise ValueError(f"controller: horizon = {horizon!r}, allowed is an integer in [1, {HORIZON_MAX}]")
-        if hessian not in (None, "gauss_newton", "exact"):
-            raise ValueError(f"controller: hessian = {hessian!r}, allowed is gauss_newton, exact or None")
+        choices = (
+            ("hessian", hessian, (None, "gauss_newton", "exact")),
+            ("solver", solver, ("sqp", "ipopt")),
+            ("first_guess", first_guess, ("cold", "ipopt")),
+        )
+        for label, value, allowed in choices:
+            if value not in allowed:
+                raise ValueError(f"controller: {label} = {value!r}, allowed is {', '.join(map(str, allowed))}")
         if not is_integer(iterations_max) or iterations_max < 1:
             raise ValueError(f"controller: iterations_max = {iterations_max!r}, allowed is an integer >= 1")
         named = [signal.name for signal in given]
@@ -139,6 +156,8 @@ class Controller:
             given=tuple(given),
             estimator=estimator or ExactState(),
             iterations_max=int(iterations_max),
+            solver=solver,
+            first_guess=first_guess,
         )
         return replace(built, hessian=hessian or built._suitable_hessian)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from chargetune.model.model import Model
 from chargetune.model.parameter_space import ParameterSpace
 
-__all__ = ["Curvature", "curvature_of", "reached_states"]
+__all__ = ["Curvature", "curvature_of", "nearby_convex", "reached_states"]
 
 # Random points at which the curvature is looked at, beside start and set-point.
 POINTS = 8
@@ -77,3 +78,34 @@ def curvature_of(cost: ca.Function, model: Model, theta: ParameterSpace, setpoin
             least = float(values[0])
             along = tuple(name for name, share in zip(names, np.abs(vectors[:, 0]), strict=True) if share > 0.1)
     return Curvature(least, largest, tuple(names), along)
+
+
+def nearby_convex(matrix: Any) -> Any:
+    """A positive definite matrix near a symmetric one (SX, n x n), and that one itself where it is positive definite by far.
+
+    L D L' with d_j = max(|c_jj|, (max_i |c_ij| / beta)^2, delta) in place of the pivots c_jj.
+    Source: Gill, Murray and Wright, Practical Optimization, 1981, sec. 4.4.2.2.
+    """
+    size = matrix.shape[0]
+    rest = ca.SX(ca.densify(matrix))
+    on, off = ca.SX(0), ca.SX(0)
+    for i in range(size):
+        on = ca.fmax(on, ca.fabs(rest[i, i]))
+        for j in range(i):
+            off = ca.fmax(off, ca.fabs(rest[i, j]))
+    bound = ca.fmax(ca.fmax(on, off / np.sqrt(max(size**2 - 1, 1))), 1e-30)
+    out = ca.SX.zeros(size, size)
+    for k in range(size):
+        below = rest[:, k]
+        most = ca.SX(0)
+        for i in range(k + 1, size):
+            most = ca.fmax(most, ca.fabs(rest[i, k]))
+        pivot = ca.fmax(ca.fmax(ca.fabs(rest[k, k]), most**2 / bound), 1e-12 * (on + off) + 1e-30)
+        column = ca.SX(below)
+        column[k] = pivot
+        for i in range(k):
+            column[i] = 0
+        part = ca.mtimes(column, column.T) / pivot
+        out += part
+        rest -= part
+    return (out + out.T) / 2

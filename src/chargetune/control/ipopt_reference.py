@@ -2,7 +2,8 @@
 
 Direct multiple shooting with the states as variables and the model as equality constraints, slacks as variables, exact
 Hessians. It shares the controller's own functions with `ocp` and nothing else: no condensing, no scaling, no
-linearisation. Some hundred times slower; for tests, and on request: ``run_episode(..., act=ipopt_act)``.
+linearisation. Some hundred times slower; for tests, and on request: ``Controller.build(..., solver="ipopt")``, or as
+``first_guess="ipopt"``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from chargetune.control.sqp import SolveStatus
 from chargetune.runtime.cache import cached
 from chargetune.runtime.split import split
 
-__all__ = ["Nlp", "ipopt_act", "multiple_shooting"]
+__all__ = ["Nlp", "ipopt_act", "ipopt_plan", "multiple_shooting"]
 
 # At 1e-9 IPOPT stops 2 mA early where a charge is nearly done and the cost is flat.
 OPTIONS: dict[str, Any] = {
@@ -42,7 +43,6 @@ class Nlp:
     equalities: int
     inequalities: int
     bounds: ca.Function
-    fallback: ca.Function
 
 
 def multiple_shooting(controller: Controller) -> Nlp:
@@ -89,13 +89,11 @@ def multiple_shooting(controller: Controller) -> Nlp:
     nlp = {"x": ca.vertcat(ca.vec(inputs), ca.vec(states), slack), "p": parameters, "f": cost, "g": ca.vertcat(*gaps, *rows)}
     arguments = [theta, nominal, now, last, given]
     lower, upper = zip(*bounds, strict=True)
-    p = controller.parameters(theta, nominal, signals[0])
     return Nlp(
         solver=ca.nlpsol("nlp", "ipopt", nlp, OPTIONS),
         equalities=horizon * nx,
         inequalities=sum(row.shape[0] for row in rows),
         bounds=ca.Function("bounds", arguments, [ca.vertcat(*lower), ca.vertcat(*upper)]),
-        fallback=ca.Function("fallback", arguments, [controller.fallback(theta, p, now, signals[0])]),
     )
 
 
@@ -107,40 +105,60 @@ def ipopt_act(
     given: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], Memory, Info]:
     """One control step by IPOPT, with the signature of `control_step.act`; kkt is 0 where IPOPT reports success, else infinite."""
-    problem = problem_of(controller)
-    nlp = cached(f"ipopt {controller.structure}", lambda: multiple_shooting(controller))
-    model, horizon, nominal = controller.model, controller.horizon, controller.model.nominal
-    nx, nu, size = len(model.states), len(model.inputs), horizon * len(model.inputs)
-    q, last = numbers(controller, theta, given), memory.last_input
-    signals = np.zeros(len(controller.given) * (horizon + 2)) if given is None else given
+    problem, last = problem_of(controller), memory.last_input
+    q = numbers(controller, theta, given)
     estimate, corrected = problem.correct(memory.estimator, received, last, q)
     now = np.array(estimate).ravel()
-    arguments = (theta, nominal, np.where(np.isfinite(now), now, 0.0), last, signals)
-    lower, upper = (np.array(bound).ravel() for bound in nlp.bounds(*arguments))
+    plan, good = ipopt_plan(controller, now, theta, memory, given)
+    status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
+    if not np.all(np.isfinite(plan)):
+        known = problem.first(np.where(np.isfinite(now), now, 0.0), last)
+        declared = np.tile(np.array(problem.fallback(known, q)).ravel(), controller.horizon)
+        plan, status = np.array(problem.clip(known, declared, q)).ravel(), SolveStatus.FALLBACK
+    nu = len(controller.model.inputs)
+    u = plan[:nu]
+    ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
+    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[plan.size :]])
+    return u, Memory(ahead, u, following), Info(status, 0.0 if good else np.inf, _iterations(controller), now)
 
+
+def ipopt_plan(
+    controller: Controller, now: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory, given: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], bool]:
+    """(the inputs over the horizon from state ``now``, shape (N nu,), whether IPOPT reports success); NaN where it has no numbers.
+
+    It starts from the plan that ``memory`` holds.
+    """
+    nlp = _nlp(controller)
+    horizon, nominal = controller.horizon, controller.model.nominal
+    nx, size, slacks = len(controller.model.states), horizon * len(controller.model.inputs), len(controller.limits)
+    signals = np.zeros(len(controller.given) * (horizon + 2)) if given is None else given
+    arguments = (theta, nominal, np.where(np.isfinite(now), now, 0.0), memory.last_input, signals)
+    lower, upper = (np.array(bound).ravel() for bound in nlp.bounds(*arguments))
     warm = memory.warm[:size]
-    slacks = len(controller.limits)
     guess = np.concatenate([np.clip(warm, lower, upper), _roll_out(controller, now, warm, theta, signals), np.zeros(slacks)])
     solution = nlp.solver(
         x0=guess,
-        p=np.concatenate([now, theta, controller.setpoint, nominal, last, signals]),
+        p=np.concatenate([now, theta, controller.setpoint, nominal, memory.last_input, signals]),
         lbx=np.concatenate([lower, np.full(horizon * nx, -np.inf), np.zeros(slacks)]),
         ubx=np.concatenate([upper, np.full(horizon * nx + slacks, np.inf)]),
         lbg=np.concatenate([np.zeros(nlp.equalities), np.full(nlp.inequalities, -np.inf)]),
         ubg=0.0,
     )
     found = np.array(solution["x"]).ravel()[:size]
-    good = bool(nlp.solver.stats()["success"]) and bool(np.all(np.isfinite(found)))
     if not np.all(np.isfinite(found)):
-        found, status = np.tile(np.array(nlp.fallback(*arguments)).ravel(), horizon), SolveStatus.FALLBACK
-    else:
-        status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
-    plan = np.array(problem.clip(problem.first(arguments[2], last), found, q)).ravel()
-    u = plan[:nu]
-    ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
-    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[size:]])
-    info = Info(status, 0.0 if good else np.inf, int(nlp.solver.stats()["iter_count"]), now)
-    return u, Memory(ahead, u, following), info
+        return np.full(size, np.nan), False
+    problem = problem_of(controller)
+    known = problem.first(arguments[2], memory.last_input)
+    return np.array(problem.clip(known, found, numbers(controller, theta, given))).ravel(), bool(nlp.solver.stats()["success"])
+
+
+def _nlp(controller: Controller) -> Nlp:
+    return cached(f"ipopt {controller.structure}", lambda: multiple_shooting(controller))
+
+
+def _iterations(controller: Controller) -> int:
+    return int(_nlp(controller).solver.stats()["iter_count"])
 
 
 def _roll_out(

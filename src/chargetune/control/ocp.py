@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.controller import Controller
+from chargetune.control.convexity import nearby_convex
 from chargetune.control.estimators import finite
 from chargetune.runtime.split import split
 
@@ -54,6 +55,8 @@ class Problem:
         (now, U, D, multipliers, q) -> D with the Lagrangian's curvature in the Hessians: of a Gauss-Newton controller what
         constraints and dynamics add to the diagonal of the inputs' one, where it is positive; of an exact one all of it.
         The multipliers are those of the rows, of the cost as it is (gamma = 1).
+    convex
+        (D, lower, upper) -> D with which the QP is convex: as it is, or with the Hessian of each stage changed (`nearby_convex`).
     residual
         (U, c, D, multipliers, gamma, lower, upper) -> largest natural residual of the scaled optimality conditions.
     merit
@@ -74,6 +77,7 @@ class Problem:
     scaling: ca.Function
     quadratic: ca.Function
     curvature: ca.Function
+    convex: ca.Function
     residual: ca.Function
     merit: ca.Function
     fallback: ca.Function
@@ -219,6 +223,7 @@ def control_problem(controller: Controller) -> Problem:
         scaling=_scaling(controller, stage, final),
         quadratic=_quadratic(controller, stage, final, groups),
         curvature=_curvature(follow, second, second_final, stage, final, window),
+        convex=_convex(controller, stage, final),
         residual=_residual(controller, stage, final, groups),
         merit=_merit(controller, groups),
         fallback=_at_stage(ca.Function("fallback", [now, q], [fallback]), window, 0),
@@ -296,7 +301,8 @@ class _Bend:
         costate, multipliers = ca.SX.sym("costate", after.shape[0]), ca.SX.sym("lambda", rows.shape[0])
         total = ca.dot(costate, after) + ca.dot(multipliers, rows)
         if exact:
-            return cls(costate, multipliers, ca.sparsify(ca.hessian(total, ca.vertcat(x, u))[0]))
+            # Dense, since a convex one nearby has more entries.
+            return cls(costate, multipliers, ca.densify(ca.hessian(total, ca.vertcat(x, u))[0]))
         positive = ca.fmax(ca.diag(ca.densify(ca.hessian(total, u)[0])), 0)
         nx, nu = x.shape[0], u.shape[0]
         return cls(costate, multipliers, ca.diagcat(ca.SX(nx, nx), ca.diag(positive)) if nu else ca.SX(nx, nx))
@@ -487,6 +493,46 @@ def _quadratic(controller: Controller, stage: _Linearisation, final: _Linearisat
         span,
     ]
     return ca.Function("quadratic", [inputs, rows, vector, lower, upper, gamma], _cse(*data))
+
+
+def _convex(controller: Controller, stage: _Linearisation, final: _Linearisation) -> ca.Function:
+    """`Problem.convex`: the Riccati recursion has positive pivots where the whole Hessian is positive definite."""
+    horizon, nu = controller.horizon, len(controller.model.inputs)
+    lower, upper = (ca.SX.sym(n, horizon * nu) for n in ("lower", "upper"))
+    vector = ca.SX.sym("D", horizon * stage.length + final.length)
+    if controller.hessian != "exact":
+        return ca.Function("convex", [vector, lower, upper], [vector])
+    stages, last = _derivatives(vector, stage, final, horizon)
+    weight, smallest, largest = last[6], ca.SX(np.inf), ca.SX(0)
+    for span, (f_x, f_u, _, _, _, _, l_xx, l_ux, l_uu) in zip(reversed(_blocks(_span(lower, upper), nu)), reversed(stages), strict=True):
+        scale = ca.diag(span)
+        into = ca.mtimes(f_u, scale)
+        ahead = ca.mtimes(into.T, weight)
+        rest = ca.densify(ca.mtimes([scale, l_uu, scale]) + ca.mtimes(ahead, into))
+        law = ca.densify(ca.mtimes(scale, l_ux) + ca.mtimes(ahead, f_x))
+        weight = l_xx + ca.mtimes([f_x.T, weight, f_x])
+        for k in range(nu):
+            smallest, largest = ca.fmin(smallest, rest[k, k]), ca.fmax(largest, rest[k, k])
+            pivot, below, row = rest[k, k], rest[:, k], law[k, :]
+            weight -= ca.mtimes(row.T, row) / pivot
+            law -= ca.mtimes(below, row) / pivot
+            rest -= ca.mtimes(below, below.T) / pivot
+    sound = smallest > REGULARISATION * largest
+    nx = stage.patterns[6].size1()
+    changed = ca.vertcat(*(_nearby(stage, one, nx) for one in stages), _nearby(final, last, nx))
+    as_it_is = ca.Function("as_it_is", [vector], [vector])
+    nearby = ca.Function("nearby", [vector], _cse(changed))
+    definite = ca.Function("definite", [vector, lower, upper], _cse(sound))
+    choose = ca.Function.if_else("choose", as_it_is, nearby)
+    given = [ca.MX.sym("D", vector.shape[0]), ca.MX.sym("lower", horizon * nu), ca.MX.sym("upper", horizon * nu)]
+    return ca.Function("convex", given, [choose(definite(*given), given[0])])
+
+
+def _nearby(of: _Linearisation, parts: list[Any], nx: int) -> Any:
+    *kept, l_xx, l_ux, l_uu = parts
+    matrix = nearby_convex(ca.vertcat(ca.horzcat(l_xx, l_ux.T), ca.horzcat(l_ux, l_uu)))
+    changed = [*kept, *(ca.project(one, pattern) for one, pattern in zip(_hessians(matrix, nx), of.patterns[6:], strict=True))]
+    return ca.vertcat(*(ca.vertcat(*part.nonzeros()) for part in changed))
 
 
 def _factor(block: Any) -> Any:

@@ -129,7 +129,11 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     sizes = (len(limits) + problem.size, rows)
     _, prices = split(dual, sizes)
     bent = curvature(bend, now, inputs, derivatives, prices, q)
-    gamma = problem.scaling(bent if problem.controller.hessian == "exact" else derivatives, lower, upper)
+    if problem.controller.hessian == "exact":
+        bent = problem.convex(bent, lower, upper)
+        gamma = problem.scaling(bent, lower, upper)
+    else:
+        gamma = problem.scaling(derivatives, lower, upper)
     *data, span = problem.quadratic(inputs, c, bent, lower, upper, gamma)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.

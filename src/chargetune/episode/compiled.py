@@ -17,12 +17,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.control_step import begin, control_step, problem_of
+from chargetune.control.control_step import control_step, problem_of
 from chargetune.control.controller import Controller
+from chargetune.control.first_guess import first_memory
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.lookup_table import LookupTable
-from chargetune.episode.stepwise import check_run, signal_indices
+from chargetune.episode.stepwise import check_run, run_episode, signal_indices
 from chargetune.model.given import Given, actual, checked_given, windows
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 from chargetune.runtime.cache import cached
@@ -89,7 +90,7 @@ class CompiledEpisode:
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
-                of_theta[key] = self._of_theta(values)
+                of_theta[key] = self._of_theta(values, told)
             if id(plant) not in of_plant:
                 check_run(plant, self.steps, seed, ())
                 of_plant[id(plant)] = self._of_plant(plant, seed, told)
@@ -106,11 +107,11 @@ class CompiledEpisode:
         """What is given once an episode, shape (n,), and once an interval, shape (steps, m)."""
         check_run(plant, self.steps, seed, trips)
         of_plant = self._of_plant(plant, seed, told)
-        return self._given(self._of_theta(self.controller.theta_vector(theta)), of_plant), of_plant.unknown
+        return self._given(self._of_theta(self.controller.theta_vector(theta), told), of_plant), of_plant.unknown
 
-    def _of_theta(self, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def _of_theta(self, values: NDArray[np.float64], told: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """The controller's memory at the start, and its numbers."""
-        memory = begin(self.controller)
+        memory = first_memory(self.controller, values, told[0, : told.shape[1] - len(self.plant.given)])
         q = problem_of(self.controller).prepare(values, self.controller.setpoint, self.controller.model.nominal)
         return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
 
@@ -202,6 +203,10 @@ def compiled_episode(
     OSError when the function cannot be compiled.
     """
     check_run(plant, steps, 0, ())
+    if controller.solver != "sqp":
+        raise ValueError(
+            f"controller: solver = {controller.solver!r}, allowed is sqp where a whole episode is one function; use run_episode"
+        )
     indices = tuple(signal_indices(controller, plant))
     # A lookup_table finds the outputs by name.
     own = (
@@ -234,7 +239,9 @@ def simulate(
     compiled: bool | None = None,
     given: Given | None = None,
 ) -> Episode:
-    """One closed loop on a simulated plant, the quick way; ``given`` as for `run_episode`."""
+    """One closed loop on a simulated plant, the quick way; ``given`` as for `run_episode`. A controller with IPOPT runs step by step."""
+    if controller.solver == "ipopt":
+        return run_episode(controller, plant, steps=steps, theta=theta, seed=seed, trips=trips, given=given)
     return compiled_episode(controller, plant, steps, compiled=compiled).run(theta, seed, trips, given=given)
 
 

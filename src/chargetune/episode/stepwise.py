@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.control_step import Act, act, begin
+from chargetune.control.control_step import Act
 from chargetune.control.controller import Controller
+from chargetune.control.first_guess import act_of, first_memory
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
 from chargetune.model.given import Given, actual, checked_given, windows
@@ -29,13 +30,14 @@ def run_episode(
     theta: ArrayLike | None = None,
     seed: int = 0,
     trips: Sequence[Trip] = (),
-    control: Act = act,
+    control: Act | None = None,
     given: Given | None = None,
 ) -> Episode:
     """Run one closed loop step by step on any plant. It always returns: a failure is the episode's ending.
 
-    ``control`` is the control step, `ipopt_act` for the reference solver. ``given`` has the given signals of the controller and
-    of the plant by name (`model.given.checked_given`): numbers, sequences of at least ``steps`` values, or forecasts.
+    ``control`` is the control step, by default that of the controller's ``solver``; `ipopt_act` is the reference. ``given`` has
+    the given signals of the controller and of the plant by name (`model.given.checked_given`): numbers, sequences of at least
+    ``steps`` values, or forecasts.
 
     The plant is closed at the end, whatever happened, and before anything else is done with the result. What the plant
     raises ends the episode as PLANT, what the controller raises as SOLVER; the intervals until then are kept. A plant
@@ -46,19 +48,20 @@ def run_episode(
     indices = signal_indices(controller, plant)
     check_run(plant, steps, seed, trips)
     seen, plant = _told(controller, plant, given, steps)
+    step = control or act_of(controller)
     records: list[tuple[NDArray[np.float64], Measurement, SolveStatus, float, int, NDArray[np.float64]]] = []
     ending, message = Ending.DONE, ""
     first: Measurement | None = None
     blind = broken = 0
     try:
         first = _asked(plant, partial(plant.reset, seed))
-        memory, measurement = begin(controller), first
+        memory, measurement = first_memory(controller, values, seen[0] if controller.given else None), first
         message = tripped(plant, first, trips)
         ending = Ending.LIMIT if message else Ending.DONE
         for k in range(0 if message else steps):
             # A control step for controllers without given signals need not know of them.
             known = (seen[k],) if controller.given else ()
-            u, memory, info = control(controller, measurement.received[indices], values, memory, *known)
+            u, memory, info = step(controller, measurement.received[indices], values, memory, *known)
             _refuse_unusable(u, len(plant.inputs))
             measurement = _asked(plant, partial(plant.step, u))
             records.append((u, measurement, info.status, info.kkt, info.iterations, info.estimate))
