@@ -132,6 +132,8 @@ def score_limits(
         so that ``penalty`` is what a violation of one more tolerance costs, in the unit of the objective.
     windows
         With them the score has the profile of the limits.
+    metrics
+        Episode -> figures for people; ``unsolved_percent``, the share of control steps that were not solved, is always one of them.
 
     Raises ValueError for unknown signals and for two limits of one name.
     """
@@ -159,7 +161,7 @@ def score_limits(
         performance=total,
         excess=excess,
         tolerance={limit.name: limit.tolerance for limit in limits},
-        metrics={} if metrics is None else metrics(episode),
+        metrics={"unsolved_percent": 100 * episode.unsolved_share, **({} if metrics is None else metrics(episode))},
         profile={}
         if windows is None
         else {limit.name: worst_by_window(*samples[limit.name], windows.count) for limit in limits if limit.by_window},
