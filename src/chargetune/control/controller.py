@@ -47,11 +47,11 @@ class Controller:
 
     so that where bounds leave no input within the rate the bounds win.
 
-    ``hessian``: with "gauss_newton" the costs' Hessians are the curvature of the problem, which has to be convex in the inputs
-    and the states that they reach; with "exact" it is the Lagrangian's, made convex where it is not, for costs that are flat (economic
-    ones) or bent downwards. `build` chooses by `curvatures`. Of a problem that is not convex the solver finds a local
-    solution: the one downhill of its ``first_guess``, which is the repeated last input, or the plan that IPOPT finds from ``start``.
-    ``solver`` = "ipopt" leaves every solve to IPOPT, step by step only.
+    ``hessian``: with "gauss_newton" the costs' Hessians are the curvature of the problem; they have to be convex in the inputs and
+    the states that these reach. With "exact" it is the Lagrangian's, made convex where it is not: for costs that are bent downwards, or
+    linear in the states (economic ones) of a nonlinear model. `build` chooses by `curvatures`. Of a problem that is not convex the
+    solver finds a local solution: the one downhill of its ``first_guess``, which is the input before, repeated, or the plan that
+    IPOPT finds from ``start``. ``solver`` = "ipopt" leaves every solve to IPOPT, step by step only.
     """
 
     model: Model
@@ -171,8 +171,20 @@ class Controller:
     @property
     def _suitable_hessian(self) -> Hessian:
         found = self.curvatures.values()
-        convex = all(one.convex for one in found)
-        return "gauss_newton" if convex and any(one.largest > 0 for one in found) else "exact"
+        if not all(one.convex for one in found):
+            return "exact"
+        # The costs' own Hessian is all there is where states have a part in it, or where nothing else is bent.
+        return "gauss_newton" if any(one.of_states for one in found) or self._linear else "exact"
+
+    @property
+    def _linear(self) -> bool:
+        """Whether dynamics and limits are linear in (x, u)."""
+        x, u, p = self.model.f.sx_in()
+        bent = [self.model.f(x, u, p)]
+        for limit in self.limits:
+            arguments = limit.rows.sx_in()
+            bent.append(limit.rows(x, u, *arguments[2:]))
+        return all(ca.is_linear(e, ca.vertcat(x, u)) for e in bent)
 
     @property
     def given_names(self) -> tuple[str, ...]:

@@ -22,13 +22,15 @@ POINTS = 8
 class Curvature:
     """Least and largest eigenvalue of a cost's Hessian over the points looked at.
 
-    ``of``: what the Hessian is taken of, the inputs and the states that they reach; ``along``: those that the least one points to.
+    ``of``: what the Hessian is taken of, the inputs and the states that they reach; ``along``: those that the least one points to;
+    ``of_states``: whether the states have a part in it.
     """
 
     least: float
     largest: float
     of: tuple[str, ...]
     along: tuple[str, ...]
+    of_states: bool
 
     @property
     def convex(self) -> bool:
@@ -65,7 +67,7 @@ def curvature_of(cost: ca.Function, model: Model, theta: ParameterSpace, setpoin
     for _ in range(POINTS):
         point = draw.uniform(theta.lower, theta.upper) if default.size else default
         places.append((draw.uniform(-1.0, 1.0, size), point, draw.uniform(-1.0, 1.0, nx)))
-    least, largest = 0.0, 0.0
+    least, largest, of_states = 0.0, 0.0, False
     along: tuple[str, ...] = ()
     for xu, at, now in places:
         signals = draw.uniform(-1.0, 1.0, given.shape[0])
@@ -73,11 +75,13 @@ def curvature_of(cost: ca.Function, model: Model, theta: ParameterSpace, setpoin
         if not matrix.size or not np.all(np.isfinite(matrix)):
             continue
         values, vectors = np.linalg.eigh(matrix)
+        first_state = len(names) - len(reached)
+        of_states = of_states or bool(np.any(matrix[first_state:, first_state:]))
         largest = max(largest, float(values[-1]))
         if values[0] < least:
             least = float(values[0])
             along = tuple(name for name, share in zip(names, np.abs(vectors[:, 0]), strict=True) if share > 0.1)
-    return Curvature(least, largest, tuple(names), along)
+    return Curvature(least, largest, tuple(names), along, of_states)
 
 
 def nearby_convex(matrix: Any) -> Any:
