@@ -36,9 +36,11 @@ if TYPE_CHECKING:
     from chargetune.learning.twin.simulated_twin import SimulatedTwin
     from chargetune.learning.twin.twin import Twin, Uncertain
     from chargetune.learning.twin_tuner import TwinTuner
+    from chargetune.model.do_mpc import from_do_mpc
     from chargetune.model.integrators import rk4
     from chargetune.model.model import Model, Signal
     from chargetune.model.parameter_space import Parameter, ParameterSpace
+    from chargetune.plants.gymnasium import GymnasiumPlant
     from chargetune.plants.range_of_use import RangeOfUse
     from chargetune.plants.sensors import Sensors
     from chargetune.plants.simulated import SimulatedPlant
@@ -59,6 +61,7 @@ __all__ = [
     "ExactState",
     "ExpectedImprovement",
     "ExtendedKalman",
+    "GymnasiumPlant",
     "IterativeLearning",
     "LogNormal",
     "Model",
@@ -93,6 +96,7 @@ __all__ = [
     "Variation",
     "Windows",
     "__version__",
+    "from_do_mpc",
     "identify",
     "load_config",
     "open_study",
@@ -117,6 +121,7 @@ _MODULES = {
     "ExactState": "control.estimators",
     "ExpectedImprovement": "learning.black_box.expected_improvement",
     "ExtendedKalman": "control.estimators",
+    "GymnasiumPlant": "plants.gymnasium",
     "IterativeLearning": "learning.closed_loop.iterative_learning",
     "LogNormal": "plants.variation",
     "Model": "model.model",
@@ -150,6 +155,7 @@ _MODULES = {
     "Uniform": "plants.variation",
     "Variation": "plants.variation",
     "Windows": "episode.score_limits",
+    "from_do_mpc": "model.do_mpc",
     "identify": "battery.identification.pulse_fit",
     "load_config": "battery.studies.study_file",
     "open_study": "battery.studies.open_study",
