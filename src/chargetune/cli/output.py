@@ -16,7 +16,7 @@ from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["beside", "console", "metrics_table", "result_line", "shown", "theta_lines", "trials_table"]
+__all__ = ["beside", "console", "metrics_table", "number", "range_line", "result_line", "shown", "theta_lines", "trials_table"]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -59,6 +59,16 @@ def result_line(result: StudyResult) -> str:
     """Which trial is the result of a study, and why."""
     which = "no result" if result.trial is None else f"the result is trial {result.trial.number}"
     return f"{which}: {result.sentence}"
+
+
+def range_line(entries: Mapping[str, float | list[float] | None]) -> str:
+    """The range of use in one line: what differs, and by how much."""
+    shown = [
+        f"{name} {value[0]:g} to {value[1]:g}" if isinstance(value, list) else f"{name} +-{value:g}"
+        for name, value in entries.items()
+        if value
+    ]
+    return ", ".join(shown).replace("fade +-", "fade ").replace("growth +-", "growth ") or "nothing differs but the noise"
 
 
 def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) -> Table:
