@@ -14,8 +14,9 @@ from rich.table import Table
 from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
 from chargetune.battery.certification.default_range import default_range
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.range_settings import range_line
 from chargetune.battery.studies.study_file import problem_of_document
-from chargetune.cli.output import beside, console, number, range_line
+from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor
 from chargetune.study.result import read_result
@@ -147,4 +148,6 @@ def _print(certificate: dict[str, Any]) -> None:
             f"{label} {number(f[f'{name}.{key}'])}" for label, key in (("median", "q50"), ("95 %", "q95"), ("worst", "worst"))
         )
         screen.print(f"{name.removesuffix('_min')} in minutes: {values}")
-    screen.print(f"[dim]range of use ({origin['range']}): {range_line(certificate['range'])}. {certificate['drawn']}[/]", soft_wrap=True)
+    # A name in brackets is no markup.
+    use = f"range of use ({origin['range']}): {range_line(certificate['range'])}. {certificate['drawn']}"
+    screen.print(use, style="dim", markup=False, soft_wrap=True)

@@ -16,7 +16,7 @@ from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["beside", "console", "metrics_table", "number", "range_line", "result_line", "shown", "theta_lines", "trials_table"]
+__all__ = ["beside", "console", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "trials_table"]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -61,16 +61,6 @@ def result_line(result: StudyResult) -> str:
     return f"{which}: {result.sentence}"
 
 
-def range_line(entries: Mapping[str, float | list[float] | None]) -> str:
-    """The range of use in one line: what differs, and by how much."""
-    shown = [
-        f"{name} {value[0]:g} to {value[1]:g}" if isinstance(value, list) else f"{name} +-{value:g}"
-        for name, value in entries.items()
-        if value
-    ]
-    return ", ".join(shown).replace("fade +-", "fade ").replace("growth +-", "growth ") or "nothing differs but the noise"
-
-
 def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) -> Table:
     """One column a run, one row a figure."""
     table = Table(box=None, pad_edge=False)
@@ -80,13 +70,18 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) 
     table.add_column("")
     for key, label, unit in ROWS:
         table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
-    drawn = {name: s.metrics for name, s in scores.items() if s and "plants" in s.metrics}
-    if drawn:
-        counts = (f"{m['violating_plants']:.0f} of {m['plants']:.0f}" if (m := drawn.get(name)) else "-" for name in scores)
+    if any(s and "plants" in s.metrics for s in scores.values()):
+        counts = map(plants_over, scores.values())
         table.add_row("drawn plants over a limit; the figures above are their means, over a limit their worst", *counts, "")
     verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
     table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
     return table
+
+
+def plants_over(score: Score | None) -> str:
+    """Of a trial over a range of use the drawn plants that broke a limit, "n of N"; a dash for any other trial."""
+    drawn = {} if score is None else score.metrics
+    return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:
@@ -99,7 +94,9 @@ def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[floa
 def trials_table(trials: Sequence[Trial]) -> Table:
     """One row a trial."""
     table = Table(box=None, pad_edge=False)
-    for heading in ("trial", "status", "overshoot mV", "t80 min", "t95 min", "G", "limits", "ending"):
+    drawn = any(t.score is not None and "plants" in t.score.metrics for t in trials)
+    of_range = ["plants over"] if drawn else []
+    for heading in ("trial", "status", "overshoot mV", "t80 min", "t95 min", "G", *of_range, "limits", "ending"):
         table.add_column(heading, justify="left" if heading in ("status", "limits", "ending") else "right")
     for t in trials:
         s = t.score
@@ -110,6 +107,7 @@ def trials_table(trials: Sequence[Trial]) -> Table:
             number(s.metrics.get("t80_min")) if s else "-",
             number(s.metrics.get("t95_min")) if s else "-",
             f"{s.performance:.4g}" if s else "-",
+            *([plants_over(s)] if drawn else []),
             ("kept" if s.feasible else "[red]broken[/]") if s else "-",
             t.ending or "",
         )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from chargetune.battery.validation import check_number
 
-__all__ = ["MEANING", "NOT_ELECTROCHEMICAL", "ChargingRangeSettings"]
+__all__ = ["MEANING", "NOT_ELECTROCHEMICAL", "ChargingRangeSettings", "range_line"]
 
 # What each entry says of the plants, as a certificate states it.
 MEANING = {
@@ -88,6 +89,22 @@ class ChargingRangeSettings:
         return pairs | {name: getattr(self, name) for name in MEANING if name not in pairs}
 
     @property
+    def line(self) -> str:
+        """`range_line` of these entries."""
+        return range_line(self.entries)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries by which plants or charges differ."""
         return tuple(name for name, value in self.entries.items() if (value[0] < value[1] if isinstance(value, list) else value))
+
+
+def range_line(entries: Mapping[str, float | Sequence[float] | None]) -> str:
+    """What differs, in one line: "soc_start 0.05 to 0.5, resistance +-0.2, growth 0.1"."""
+    shown = []
+    for name, value in entries.items():
+        if isinstance(value, (int, float)) and value:
+            shown.append(f"{name} {'' if name in ('fade', 'growth') else '+-'}{value:g}")
+        elif isinstance(value, Sequence):
+            shown.append(f"{name} {value[0]:g} to {value[1]:g}")
+    return ", ".join(shown) or "nothing differs but the noise"
