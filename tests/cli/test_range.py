@@ -18,7 +18,7 @@ RANGE = {"soc_start": [0.3, 0.5], "resistance": 0.1, "growth": 0.2, "draws": 12}
 TABLES = {
     "study": {"name": "use", "tuner": "range", "trials": 2},
     "controller": {"mismatch_seed": 1, "horizon": 3},
-    "episode": {"steps": 90, "soc_start": 0.4},
+    "episode": {"steps": 150, "soc_start": 0.4},
     "sensors": {"voltage_noise_sd_V": 0.0005},
     "theta.backoff": {"nodes": 2, "lower_V": 0.0, "upper_V": 0.2},
 }
@@ -114,3 +114,24 @@ def test_a_range_that_cannot_be_tuned_is_refused(tables, words, tmp_path, refuse
     path = tmp_path / "s.toml"
     path.write_text(study_text(**TABLES, **tables))
     assert words in refused("tune", path, "--store", tmp_path / "s.sqlite")
+
+
+def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
+    done = chargetune("compare", folder / "use.toml", "--store", folder / "use.sqlite", "--draws", 4, "--workers", 1, "--json")
+    told = json.loads(done.stdout)
+    rows = {row["name"]: row for row in told["rows"]}
+    assert list(rows) == ["CC-CV", "nominal MPC", "best constant backoff", "tuned", "MPC that knows each plant", "plant oracle"]
+    assert {row["draws"] for row in rows.values()} == {told["draws"]} == {4}
+    assert (rows["plant oracle"]["violations"], rows["plant oracle"]["ratio"]) == (0, 1.0)
+    assert told["range"]["soc_start"] == [0.3, 0.5]
+    assert told["result"]["trial"] in {t["number"] for t in trials}
+    text = chargetune("compare", folder / "use.toml", "--draws", 2, "--workers", 1).stdout
+    assert "The same 2 drawn plants in every row" in re.sub(r"\s+", " ", text)
+    assert "of 2" in text
+
+
+def test_compare_refuses_what_has_no_meaning_over_a_range(folder, tmp_path, refused):
+    assert "--figure is given for a study with a table [range]" in refused("compare", folder / "use.toml", "--figure", tmp_path / "a.pdf")
+    plain = tmp_path / "s.toml"
+    plain.write_text(study_text())
+    assert "--draws 3: allowed only for a study with a table [range]" in refused("compare", plain, "--draws", 3)

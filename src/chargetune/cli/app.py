@@ -226,15 +226,22 @@ def compare(
     config: ConfigFile,
     store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise that the controllers see.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws, and of the noise that the controllers see.")] = 0,
+    draws: Annotated[
+        int | None,
+        typer.Option(min=1, help="Plants drawn from the range of use of a study with [range]; 40 by default.", show_default=False),
+    ] = None,
     workers: Workers = 2,
     figure: Annotated[Path | None, typer.Option(help="Figure to write (png, pdf, svg).")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle."""
+    """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle.
+
+    With a table [range]: plants that are drawn from it, with violations and mean times.
+    """
     from chargetune.cli.compare import compare_command
 
-    compare_command(config, store=store, study=study, seed=seed, workers=workers, figure=figure, as_json=as_json)
+    compare_command(config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, as_json=as_json)
 
 
 @app.command()
