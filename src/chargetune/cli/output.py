@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 
 from chargetune.battery.charging.problem import ChargingProblem
@@ -97,7 +97,8 @@ def trials_table(trials: Sequence[Trial]) -> Table:
     drawn = any(t.score is not None and "plants" in t.score.metrics for t in trials)
     of_range = ["plants over"] if drawn else []
     for heading in ("trial", "status", "overshoot mV", "t80 min", "t95 min", "G", *of_range, "limits", "ending"):
-        table.add_column(heading, justify="left" if heading in ("status", "limits", "ending") else "right")
+        side: JustifyMethod = "left" if heading in ("status", "limits", "ending") else "right"
+        table.add_column(heading, justify=side, no_wrap=heading in of_range)
     for t in trials:
         s = t.score
         table.add_row(
