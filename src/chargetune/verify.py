@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 __all__ = ["Difference", "upper_bound", "verify"]
 
-FORMAT = "chargetune certificate 1"
+FORMATS = ("chargetune certificate 1", "chargetune certificate 2")
 MARKS = {"t80_min": 0.80, "t90_min": 0.90, "t95_min": 0.95, "t99_min": 0.99}
 SHARES = {"q05": 5, "q50": 50, "q95": 95, "worst": 100}
 # Two ways of adding the same numbers differ in the last digits.
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
+# How far a trace may start from what was drawn: an electrochemical model is read just after its first jump of the current.
+START = {"soc_start": 1e-9, "ambient_K": 1e-3}
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,9 @@ def verify(path: str | Path) -> list[Difference]:
         stated = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file} is not JSON: {error}") from error
-    if not isinstance(stated, dict) or stated.get("format") != FORMAT:
-        raise ValueError(f"{file}: format = {stated.get('format') if isinstance(stated, dict) else stated!r}, allowed is {FORMAT!r}")
+    if not isinstance(stated, dict) or stated.get("format") not in FORMATS:
+        found = stated.get("format") if isinstance(stated, dict) else stated
+        raise ValueError(f"{file}: format = {found!r}, allowed are {' and '.join(map(repr, FORMATS))}")
     try:
         return _differences(file, stated)
     except (KeyError, TypeError, IndexError) as error:
@@ -141,7 +144,43 @@ def _minutes(first: float, soc: NDArray[np.float64], mark: float, step: float) -
 
 
 def _draws(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[Difference]:
-    """Draws that the declared spread does not allow."""
+    """Draws that are outside what is declared, or not independent."""
+    out = _of_spread(stated, arrays) if stated["format"] == FORMATS[0] else _of_range(stated, arrays)
+    if len(np.unique(arrays["seed"])) < len(arrays["seed"]):
+        out.append(Difference("episodes", len(arrays["seed"]), "some noise seeds are the same: not independent"))
+    return out
+
+
+def _of_range(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[Difference]:
+    """Draws that the stated range does not allow, and starts of traces that are not what was drawn."""
+    declared, out = dict(stated["range"]), []
+    count = len(arrays["length"])
+    pairs = {"soc_start": declared.pop("soc_start") or [stated["soc_start"]] * 2, "ambient_K": declared.pop("ambient_K")}
+    aging = [declared.pop("fade"), declared.pop("growth")]
+    allowed = {name: (-width, width) for name, width in declared.items() if width}
+    allowed |= {name: tuple(pair) for name, pair in pairs.items() if pair} | ({"age": (0.0, 1.0)} if any(aging) else {})
+    drawn = {name.removeprefix("drawn."): values for name, values in arrays.items() if name.startswith("drawn.")}
+    for name in sorted(set(allowed) | set(drawn)):
+        if name not in allowed or name not in drawn:
+            out.append(Difference(f"range.{name}", allowed.get(name), "drawn" if name in drawn else "not drawn"))
+            continue
+        (low, high), values = allowed[name], drawn[name]
+        if len(values) != count or not (values.min() >= low - RELATIVE and values.max() <= high + RELATIVE):
+            out.append(Difference(f"range.{name}", [low, high], f"{len(values)} drawn, {values.min():g} to {values.max():g}"))
+    begun = arrays["length"].astype(int) > 0
+    first = np.concatenate([[0], np.cumsum(arrays["length"].astype(int))])[:-1][begun]
+    for name, signal in (("soc_start", "soc"), ("ambient_K", "temperature_K")):
+        if name in drawn and f"start.{signal}" in arrays:
+            off = np.abs(arrays[f"start.{signal}"][first] - drawn[name].reshape(count)[begun])
+            if off.size and off.max() > START[name]:
+                out.append(Difference(f"drawn.{name}", "the start of each trace", f"up to {off.max():g} off"))
+    if not np.array_equal(arrays["soc_start"], drawn["soc_start"].reshape(count)):
+        out.append(Difference("soc_start", "as drawn", "another"))
+    return out
+
+
+def _of_spread(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[Difference]:
+    """Draws of a certificate of format 1 that its spread does not allow."""
     spread, out = stated["spread"], []
     lowest, highest = float(stated["soc_start"]) - spread["soc_start"], float(stated["soc_start"]) + spread["soc_start"]
     start = arrays["soc_start"]
@@ -159,8 +198,6 @@ def _draws(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> lis
             high *= 1.0 + spread["growth"]
         if factors.min() < low - RELATIVE or factors.max() > high + RELATIVE:
             out.append(Difference(f"spread.{what}", spread[what], f"{table} drawn {factors.min():g} to {factors.max():g}"))
-    if len(np.unique(arrays["seed"])) < len(arrays["seed"]):
-        out.append(Difference("episodes", len(arrays["seed"]), "some noise seeds are the same: not independent"))
     return out
 
 

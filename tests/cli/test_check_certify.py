@@ -92,13 +92,17 @@ def store(chargetune_here, study, tmp_path):
 
 def test_certify_and_verify(chargetune_here, store, tmp_path):
     target = tmp_path / "out" / "c.json"
-    some = ("--episodes", 30, "--resistance", 0.01, "--growth", 0.02)
+    some = ("--episodes", 30, "--resistance", 0.01, "--growth", 0.02, "--soc-start", 0.3, 0.5)
     code, out, _ = chargetune_here("certify", store, *some, "-o", target, "--json")
     assert code == 0
     told = json.loads(out)
     assert told == json.loads(target.read_text())
     assert told["figures"]["episodes"] == 30
-    assert (told["origin"]["study"], told["spread"]["resistance"], told["spread"]["growth"]) == ("quick", 0.01, 0.02)
+    use = told["range"]
+    assert (told["origin"]["study"], use["resistance"], use["growth"], use["soc_start"]) == ("quick", 0.01, 0.02, [0.3, 0.5])
+    # What no option changes is the default.
+    assert (use["capacity"], use["fade"], use["ambient_K"]) == (0.02, 0.05, None)
+    assert told["origin"]["range"] == "the default, since the study has no table [range], with other soc_start, resistance, growth"
     assert told["origin"]["trials"] == 6
     assert {p.suffix for p in target.parent.iterdir()} == {".json", ".npz", ".png"}
     # The theta is that of the best feasible trial.
@@ -133,7 +137,10 @@ def test_certify_and_verify(chargetune_here, store, tmp_path):
         (("--study", "other"), "other"),
         (("--trial", "6"), "--trial 6: study 'quick' has no such trial, allowed is 0 to 5"),
         (("--confidence", "1"), "--confidence = 1"),
-        (("--resistance", "-1"), "resistance = -1"),
+        (("--resistance", "-1"), "range: resistance = -1"),
+        (("--soc-start", "0.5", "0.4"), "range: soc_start = [0.5, 0.4], allowed is [lowest, highest]"),
+        (("--soc-start", "0.1", "0.9"), "range: soc_start = [0.1, 0.9], allowed is less than the SOC that is charged to, 0.8"),
+        (("--ambient-K", "280", "300"), "range: ambient_K = [280.0, 300.0], allowed only for a cell with a [thermal] table"),
         (("-o", "c.txt"), "c.txt"),
     ],
 )

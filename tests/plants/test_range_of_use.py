@@ -52,6 +52,13 @@ def test_one_number_changes_what_it_says_by_its_sensitivities():
         assert one.plant.start_state.tolist() == [0.5, 0.0]
 
 
+def test_without_variations_the_noise_alone_differs():
+    first, second = drawn(count=2)
+    assert first.values == second.values == {}
+    assert first.seed != second.seed
+    assert first.plant.start_state.tolist() == [0.5, 0.0]
+
+
 def test_variations_multiply_and_entries_have_their_own():
     both = (
         Variation("make", Uniform(-0.2, 0.2), parameters={"r": 1.0}),

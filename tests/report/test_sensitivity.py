@@ -45,8 +45,8 @@ def test_another_system_cannot_be_evaluated(tmp_path):
 
 
 def test_evaluated_again_gives_the_same(view):
-    assert again(view.problem, view.tuned) < 1e-9
-    assert again(view.problem, view.trials[6]) is None
+    assert again(view, view.tuned) < 1e-9
+    assert again(view, view.trials[6]) is None
 
 
 def test_rank_correlation_by_hand(tmp_path):

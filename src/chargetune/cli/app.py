@@ -226,15 +226,22 @@ def compare(
     config: ConfigFile,
     store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise that the controllers see.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws, and of the noise that the controllers see.")] = 0,
+    draws: Annotated[
+        int | None,
+        typer.Option(min=1, help="Plants drawn from the range of use of a study with [range]; 40 by default.", show_default=False),
+    ] = None,
     workers: Workers = 2,
     figure: Annotated[Path | None, typer.Option(help="Figure to write (png, pdf, svg).")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle."""
+    """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle.
+
+    With a table [range]: plants that are drawn from it, with violations and mean times.
+    """
     from chargetune.cli.compare import compare_command
 
-    compare_command(config, store=store, study=study, seed=seed, workers=workers, figure=figure, as_json=as_json)
+    compare_command(config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, as_json=as_json)
 
 
 @app.command()
@@ -245,20 +252,28 @@ def certify(
     episodes: Annotated[int, typer.Option(min=1, help="Fresh episodes.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 0,
     confidence: Annotated[float, typer.Option(help="Confidence of the bound on the violation probability.")] = 0.95,
-    soc_start: Annotated[float, typer.Option(help="SOC at the start varies by +- this.")] = 0.03,
-    resistance: Annotated[float, typer.Option(help="R0, R1, .. of the plant vary by +- this share.")] = 0.05,
-    capacitance: Annotated[float, typer.Option(help="C1, .. of the plant vary by +- this share.")] = 0.05,
-    capacity: Annotated[float, typer.Option(help="The plant's capacity varies by +- this share.")] = 0.02,
-    fade: Annotated[float, typer.Option(help="Share of the capacity that is lost at full age.")] = 0.05,
-    growth: Annotated[float, typer.Option(help="Share by which resistances have grown at full age.")] = 0.10,
+    soc_start: Annotated[tuple[float, float] | None, typer.Option(help="SOC at the start: lowest and highest.", metavar="LOW HIGH")] = None,
+    ambient: Annotated[
+        tuple[float, float] | None, typer.Option("--ambient-K", help="Ambient temperature: lowest and highest.", metavar="LOW HIGH")
+    ] = None,
+    resistance: Annotated[float | None, typer.Option(help="R0, R1, .. of the plant, all in common, vary by +- this share.")] = None,
+    resistance_by_node: Annotated[float | None, typer.Option(help="Each node of these tables varies by +- this share.")] = None,
+    capacitance: Annotated[float | None, typer.Option(help="C1, .. of the plant, all in common, vary by +- this share.")] = None,
+    capacitance_by_node: Annotated[float | None, typer.Option(help="Each node of these tables varies by +- this share.")] = None,
+    capacity: Annotated[float | None, typer.Option(help="The plant's capacity varies by +- this share.")] = None,
+    fade: Annotated[float | None, typer.Option(help="Share of the capacity that is lost at full age.")] = None,
+    growth: Annotated[float | None, typer.Option(help="Share by which resistances have grown at full age.")] = None,
+    voltage_bias: Annotated[float | None, typer.Option("--voltage-bias-V", help="The voltage sensor is wrong by +- this.")] = None,
     workers: Workers = 1,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Certificate to write (.json); traces and figure go beside it.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run the tuned controller on fresh episodes with other plants and bound the probability of a violation."""
-    from chargetune.battery.certification.variations import PlantVariation
+    """Run the tuned controller on fresh episodes of its range of use and bound the probability of a violation.
+
+    The range is that of the study's table [range], else a default one; each option changes one entry of it.
+    """
     from chargetune.cli.certify import certify_command
 
     certify_command(
@@ -268,7 +283,18 @@ def certify(
         episodes=episodes,
         seed=seed,
         confidence=confidence,
-        spread=PlantVariation(soc_start, resistance, capacitance, capacity, fade, growth),
+        changes={
+            "soc_start": soc_start,
+            "ambient_K": ambient,
+            "resistance": resistance,
+            "resistance_by_node": resistance_by_node,
+            "capacitance": capacitance,
+            "capacitance_by_node": capacitance_by_node,
+            "capacity": capacity,
+            "fade": fade,
+            "growth": growth,
+            "voltage_bias_V": voltage_bias,
+        },
         workers=workers,
         output=output,
         as_json=as_json,

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
-from chargetune.battery.certification.variations import PlantVariation
+from chargetune.battery.certification.default_range import default_range
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.range_settings import range_line
 from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
@@ -30,12 +34,15 @@ def certify_command(
     episodes: int,
     seed: int,
     confidence: float,
-    spread: PlantVariation,
+    changes: Mapping[str, Any],
     workers: int,
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Run the theta of a trial, or of the study's result, on fresh episodes and write the certificate."""
+    """Run the theta of a trial, or of the study's result, on fresh episodes of the study's range and write the certificate.
+
+    ``changes`` are entries of the range that the certificate has another value of.
+    """
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
     with Store(location, read_only=True) as store:
@@ -58,7 +65,7 @@ def certify_command(
         raise ValueError(f"{store.label}: study {record.name!r} has no trial with a score, so there is nothing to certify")
     if "cell" not in record.identity["config"]:
         raise ValueError(f"{store.label}: study {record.name!r} is not one of battery charging")
-    problem = problem_of_document(record.identity["config"])
+    problem, whose = _with_range(problem_of_document(record.identity["config"]), changes)
     target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
@@ -68,7 +75,7 @@ def certify_command(
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("certifying", total=episodes, note="")
-        for portion in run_charges(problem, best.theta, spread=spread, seed=seed, episodes=episodes, executor=executor):
+        for portion in run_charges(problem, best.theta, seed=seed, episodes=episodes, executor=executor):
             charges += portion
             violating = sum(charge.score is None or not charge.score.feasible for charge in charges)
             progress.update(task, advance=len(portion), note=f"{violating} violating")
@@ -84,8 +91,8 @@ def certify_command(
             "trial": best.number,
             "trials": len(trials),
             "why": f"it is the result: {result.sentence}" if trial is None else "it was named",
+            "range": whose,
         },
-        spread=spread,
         seed=seed,
         confidence=confidence,
     )
@@ -100,6 +107,14 @@ def certify_command(
     _print(certificate)
     screen.print(f"certificate {target}\ntraces {target.with_name(certificate['traces']['file'])}\nfigure {figure}", soft_wrap=True)
     screen.print(f"[dim]recompute every figure from the traces: chargetune verify {target}[/]", soft_wrap=True)
+
+
+def _with_range(problem: ChargingProblem, changes: Mapping[str, Any]) -> tuple[ChargingProblem, str]:
+    """The problem with the range that is certified, and where that is from."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    whose = "the default, since the study has no table [range]" if problem.range is None else "the study's [range]"
+    settings = replace(problem.range or default_range(problem), **given)
+    return replace(problem, range=settings), whose + (f", with other {', '.join(given)}" if given else "")
 
 
 def _print(certificate: dict[str, Any]) -> None:
@@ -133,5 +148,6 @@ def _print(certificate: dict[str, Any]) -> None:
             f"{label} {number(f[f'{name}.{key}'])}" for label, key in (("median", "q50"), ("95 %", "q95"), ("worst", "worst"))
         )
         screen.print(f"{name.removesuffix('_min')} in minutes: {values}")
-    spread = ", ".join(f"{name} {value:g}" for name, value in certificate["spread"].items())
-    screen.print(f"[dim]{certificate['meaning']} PlantVariation: {spread}.[/]", soft_wrap=True)
+    # A name in brackets is no markup.
+    use = f"range of use ({origin['range']}): {range_line(certificate['range'])}. {certificate['drawn']}"
+    screen.print(use, style="dim", markup=False, soft_wrap=True)

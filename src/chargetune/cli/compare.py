@@ -10,6 +10,8 @@ from typing import Any
 from rich.table import Table
 
 from chargetune.battery.baselines.comparison import Row, compare, row_names
+from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRow, compare_range, range_row_names
+from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, number, result_line, shown
 from chargetune.cli.tune import bar
@@ -22,15 +24,32 @@ __all__ = ["compare_command"]
 
 
 def compare_command(
-    path: Path, *, store: str | None, study: str | None, seed: int, workers: int, figure: Path | None, as_json: bool
+    path: Path,
+    *,
+    store: str | None,
+    study: str | None,
+    seed: int,
+    draws: int | None,
+    workers: int,
+    figure: Path | None,
+    as_json: bool,
 ) -> None:
-    """Charge the plant of a study file in every way there is, and print one table."""
+    """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
         check_format(figure)
     config = load_config(path)
     problem = config.problem(path.parent)
     result = None if store is None else _result(store, study or config.study.name)
     theta = None if result is None or result.trial is None else problem.space.validate(result.trial.theta).tolist()
+    if problem.range is not None:
+        if figure is not None:
+            raise ValueError(
+                "--figure is given for a study with a table [range]: each row is many charges; certify draws them by condition"
+            )
+        _over_range(problem, theta, result, draws=draws or DRAWS, seed=seed, workers=workers, as_json=as_json)
+        return
+    if draws is not None:
+        raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
     names = row_names(problem, theta)
     found: dict[str, Row] = {}
     with ExitStack() as stack:
@@ -62,6 +81,63 @@ def compare_command(
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:
         screen.print(f"figure {figure}")
+
+
+def _over_range(
+    problem: ChargingProblem, theta: list[float] | None, result: StudyResult | None, *, draws: int, seed: int, workers: int, as_json: bool
+) -> None:
+    names = range_row_names(problem, theta)
+    found: dict[str, RangeRow] = {}
+    with ExitStack() as stack:
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
+        progress = stack.enter_context(bar(quiet=as_json))
+        task = progress.add_task("charging", total=len(names), note="")
+        for row in compare_range(problem, theta, draws=draws, seed=seed, executor=executor):
+            found[row.name] = row
+            progress.update(task, advance=1, note=row.name)
+    limits = [limit for limit in problem.limits_by_name if limit != "voltage_min_V"]
+    facts = [_range_facts(found[name], found[ORACLE], limits) for name in names]
+    use = {} if problem.range is None else problem.range.entries
+    if as_json:
+        print(json.dumps({"range": use, "draws": draws, "rows": facts, "result": None if result is None else result.facts()}))  # noqa: T201
+        return
+    screen, table = console(), Table(box=None, pad_edge=False)
+    for heading in ("", "chosen", "over a limit", *(f"{limit} worst" for limit in limits), "mean t80 min", "mean t90 min", "t80 / oracle"):
+        table.add_column(heading, justify="left" if heading in ("", "chosen") else "right")
+    for one in facts:
+        worst = (_excess(limit, one["worst_excess"][limit]) for limit in limits)
+        times = (number(one["mean_t80_min"]), number(one["mean_t90_min"]), number(one["ratio"], 3))
+        table.add_row(one["name"], one["setting"], f"{one['violations']} of {draws}", *worst, *times)
+    screen.print(table)
+    line = "" if problem.range is None else problem.range.line
+    screen.print(
+        f"Range of use: {line}. The same {draws} drawn plants in every row, judged by their true outputs. CC-CV has the fastest rate, and "
+        "the constant backoff the smallest value, with which all of these plants keep every limit, or the most cautious one if none "
+        "does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
+        style="dim",
+    )
+    if result is not None:
+        screen.print(f"Tuned MPC: {result_line(result)}", style="dim", markup=False, soft_wrap=True)
+
+
+def _range_facts(row: RangeRow, oracle: RangeRow, limits: list[str]) -> dict[str, Any]:
+    own, best = row.mean("t80_min"), oracle.mean("t80_min")
+    return {
+        "name": row.name,
+        "setting": row.setting,
+        "draws": len(row.scores),
+        "violations": row.violations,
+        "not_completed": sum(score is None for score in row.scores),
+        "worst_excess": {limit: row.worst_excess(limit) for limit in limits},
+        "mean_t80_min": own,
+        "mean_t90_min": row.mean("t90_min"),
+        "ratio": own / best if own is not None and best else None,
+    }
+
+
+def _excess(limit: str, value: float | None) -> str:
+    volts = limit.endswith("_V")
+    return "-" if value is None else f"{1e3 * value if volts else value:.1f} {'mV' if volts else limit.rpartition('_')[2]}"
 
 
 def _result(location: str, study: str) -> StudyResult:

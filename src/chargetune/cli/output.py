@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 
 from chargetune.battery.charging.problem import ChargingProblem
@@ -16,7 +16,7 @@ from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["beside", "console", "metrics_table", "result_line", "shown", "theta_lines", "trials_table"]
+__all__ = ["beside", "console", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "trials_table"]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -73,13 +73,18 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) 
     table.add_column("")
     for key, label, unit in ROWS:
         table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
-    drawn = {name: s.metrics for name, s in scores.items() if s and "plants" in s.metrics}
-    if drawn:
-        counts = (f"{m['violating_plants']:.0f} of {m['plants']:.0f}" if (m := drawn.get(name)) else "-" for name in scores)
+    if any(s and "plants" in s.metrics for s in scores.values()):
+        counts = map(plants_over, scores.values())
         table.add_row("drawn plants over a limit; the figures above are their means, over a limit their worst", *counts, "")
     verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
     table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
     return table
+
+
+def plants_over(score: Score | None) -> str:
+    """Of a trial over a range of use the drawn plants that broke a limit, "n of N"; a dash for any other trial."""
+    drawn = {} if score is None else score.metrics
+    return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:
@@ -94,8 +99,11 @@ def trials_table(trials: Sequence[Trial]) -> Table:
     told = {name for t in trials if t.score for name in t.score.metrics}
     figures = [(name, label) for name, label in COLUMNS if name in told]
     table = Table(box=None, pad_edge=False)
-    for heading in ("trial", "status", *(label for _, label in figures), "G", "limits", "ending"):
-        table.add_column(heading, justify="left" if heading in ("status", "limits", "ending") else "right")
+    drawn = any(t.score is not None and "plants" in t.score.metrics for t in trials)
+    of_range = ["plants over"] if drawn else []
+    for heading in ("trial", "status", *(label for _, label in figures), "G", *of_range, "limits", "ending"):
+        side: JustifyMethod = "left" if heading in ("status", "limits", "ending") else "right"
+        table.add_column(heading, justify=side, no_wrap=heading in of_range)
     for t in trials:
         s = t.score
         table.add_row(
@@ -103,6 +111,7 @@ def trials_table(trials: Sequence[Trial]) -> Table:
             t.status.value,
             *(number(s.metrics.get(name)) if s else "-" for name, _ in figures),
             f"{s.performance:.4g}" if s else "-",
+            *([plants_over(s)] if drawn else []),
             ("kept" if s.feasible else "[red]broken[/]") if s else "-",
             t.ending or "",
         )

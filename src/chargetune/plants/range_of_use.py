@@ -89,7 +89,7 @@ class RangeOfUse:
         parameters = {name: np.array(values) for name, values in model.parameters}
         start = {name: float(self.plant.start.get(name, 0.0)) for name in model.state_names}
         bias, drawn = dict(sensors.bias), {}
-        for one, part in zip(self.variations, np.split(shares, np.cumsum(self._sizes)[:-1]), strict=True):
+        for one, part in zip(self.variations, np.split(shares, np.cumsum(self._sizes, dtype=int))[:-1], strict=True):
             values = one.distribution.at(part)
             drawn[one.name] = tuple(float(v) for v in values)
             own = iter(_split(values, one, model.parameter_blocks))

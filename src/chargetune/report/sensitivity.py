@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 
-from chargetune.battery.charging.evaluate import evaluate
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.open_study import evaluation_of
 from chargetune.report.figures.convergence import worst_excess
 from chargetune.report.study_view import StudyView
+from chargetune.study.evaluation import Evaluate
 from chargetune.study.trial import Trial
 
 __all__ = ["STEP", "Sensitivity", "again", "finite_differences", "rank_correlations"]
@@ -35,12 +35,13 @@ class Sensitivity:
     excess: tuple[float | None, float | None]
 
 
-def again(problem: ChargingProblem, trial: Trial) -> float | None:
+def again(view: StudyView, trial: Trial) -> float | None:
     """The largest difference between the stored score and that of the same theta and seed now; None when either is missing.
 
     Compared are objective and excesses. A difference above rounding says that the program or the machine is another.
+    Raises ValueError for a study that is not one of battery charging.
     """
-    score, _, _ = evaluate(problem, np.array(trial.theta), trial.seed)
+    score, _, _ = _evaluation(view)(np.array(trial.theta), trial.seed)
     if score is None or trial.score is None:
         return None
     pairs = [(score.objective, trial.score.objective), *((score.excess[n], e) for n, e in trial.score.excess.items())]
@@ -48,14 +49,12 @@ def again(problem: ChargingProblem, trial: Trial) -> float | None:
 
 
 def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], None] = lambda: None) -> list[Sensitivity]:
-    """Two more episodes an entry on the simulated plant, with the seed of ``trial``: noise is the same in all of them.
+    """Two more evaluations an entry, each what a trial is, with the seed of ``trial``: draws and noise are the same in all of them.
 
     Raises ValueError for a study that is not one of battery charging: its document does not say how to evaluate.
     """
-    problem, space = view.problem, view.space
-    if problem is None:
-        raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
-    base, _, _ = evaluate(problem, np.array(trial.theta), trial.seed)
+    evaluate, space = _evaluation(view), view.space
+    base, _, _ = evaluate(np.array(trial.theta), trial.seed)
     centre, out = space.to_unit(np.array(trial.theta)), []
     for i, entry in enumerate(space.entries):
         changes: list[tuple[float | None, float | None, float | None]] = []
@@ -63,7 +62,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
             moved = centre.copy()
             moved[i] += step
             inside = -1e-12 <= moved[i] <= 1 + 1e-12
-            score = evaluate(problem, space.from_unit(moved), trial.seed)[0] if inside else None
+            score = evaluate(space.from_unit(moved), trial.seed)[0] if inside else None
             if score is None or base is None:
                 changes.append((None, None, None))
             else:
@@ -75,6 +74,13 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
         down, up = changes
         out.append(Sensitivity(entry, (down[0], up[0]), (down[1], up[1]), (down[2], up[2])))
     return out
+
+
+def _evaluation(view: StudyView) -> Evaluate:
+    """What a trial of the study was: one charge, or a theta on drawn plants."""
+    if view.problem is None:
+        raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
+    return evaluation_of("range" if view.over_range else "default", view.problem)
 
 
 def rank_correlations(view: StudyView) -> dict[str, tuple[float, float]]:

@@ -19,6 +19,8 @@ from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["ReadStudy", "StudyView", "read_studies", "read_study"]
 
+WORST_PLANT = "each trial is a theta on drawn plants of the range of use, its trace that of the plant with the largest excess"
+
 
 @dataclass(frozen=True)
 class ReadStudy:
@@ -47,6 +49,24 @@ class StudyView:
     problem: ChargingProblem | None
     result: StudyResult
     record: StudyRecord | None = None
+
+    @property
+    def over_range(self) -> bool:
+        """Whether a trial is a theta on drawn plants of a range of use, of which the trace is that of one."""
+        return self.problem is not None and self.tuner == "range"
+
+    @property
+    def judged(self) -> ChargingProblem | None:
+        """The problem as the stored traces are judged: those of a range of use hold true outputs."""
+        return judged_exactly(self.problem) if self.problem is not None and self.over_range else self.problem
+
+    @property
+    def remark(self) -> str:
+        """What must be said of the study wherever it is shown: its cell's remark, and whose the traces are."""
+        if self.problem is None:
+            return ""
+        parts = [self.problem.cell.remark] if self.problem.cell.remark else []
+        return "; ".join([*parts, WORST_PLANT] if self.over_range else parts)
 
     @property
     def untuned(self) -> Trial | None:
@@ -135,9 +155,6 @@ def _view(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyVi
     config = record.identity["config"]
     tuner = str(config.get("study", {}).get("tuner", ""))
     problem = problem_of_document(config) if "cell" in config else None
-    if problem is not None and tuner == "range":
-        # Its traces hold true outputs.
-        problem = judged_exactly(problem)
     return StudyView(
         location=store.location,
         name=record.name,

@@ -4,27 +4,30 @@ import hashlib
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.certification.certificate import figures, run_charges, write_certificate
-from chargetune.battery.certification.variations import PlantVariation, Variations
-from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.certification.certificate import charge_seed, figures, run_charges, write_certificate
+from chargetune.battery.certification.default_range import default_range
+from chargetune.battery.charging.charging_range import ChargingRange
+from chargetune.battery.charging.evaluate import evaluate
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.episode.episode import Ending
 from chargetune.study.evaluation import trial_seed
 from chargetune.verify import upper_bound, verify
-from charging_problems import changed, charging_problem
+from charging_problems import charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 CELL = default_cell()
-NONE = PlantVariation(0, 0, 0, 0, 0, 0)
-MODEST = PlantVariation(soc_start=0.1, resistance=0.002, growth=0.0)
-ONLY_START = replace(NONE, soc_start=0.1)
+NONE = ChargingRangeSettings()
+MODEST = ChargingRangeSettings(soc_start=(0.4, 0.6), resistance=0.002, capacitance_by_node=0.05, capacity=0.02, fade=0.05)
+ONLY_START = ChargingRangeSettings(soc_start=(0.5, 0.7))
 THETA = (0.0, 0.0)
 
 
@@ -34,8 +37,13 @@ def forced(**changes):
     return charging_problem(CELL, **(settings | changes))
 
 
-def charges(problem, spread, episodes, seed=0):
-    return [charge for portion in run_charges(problem, THETA, spread=spread, seed=seed, episodes=episodes) for charge in portion]
+def charges(problem, settings, episodes, seed=0):
+    problem = replace(problem, range=settings)
+    return [charge for portion in run_charges(problem, THETA, seed=seed, episodes=episodes) for charge in portion]
+
+
+def start(charge):
+    return charge.values["soc_start"][0]
 
 
 def threshold():
@@ -57,7 +65,7 @@ def test_the_bound_on_a_controller_with_a_known_violation_rate():
     everything = charges(forced(), ONLY_START, 300)
     counted = np.array([not charge.score.feasible for charge in everything])
     # Each episode violates exactly where the start is beyond the threshold.
-    np.testing.assert_array_equal(counted, [charge.draw.soc_start >= edge for charge in everything])
+    np.testing.assert_array_equal(counted, [start(charge) >= edge for charge in everything])
     assert abs(counted.mean() - rate) < 4 * math.sqrt(rate * (1 - rate) / counted.size)
     held = []
     for part in range(15):
@@ -70,7 +78,7 @@ def test_the_bound_on_a_controller_with_a_known_violation_rate():
 
 def test_a_planted_random_violation_with_a_known_probability():
     """One episode, broken at random in a share p of the repetitions: the bound covers p as often as it says."""
-    (kept,) = charges(forced(soc_start=0.5), replace(NONE, soc_start=0.001), 1)
+    (kept,) = charges(forced(soc_start=0.5), ChargingRangeSettings(soc_start=(0.499, 0.501)), 1)
     assert kept.score.feasible
     broken = replace(kept, score=replace(kept.score, excess={**kept.score.excess, "voltage_max_V": 0.01}))
     draw, tolerances = np.random.default_rng(0), kept.score.tolerance
@@ -82,7 +90,7 @@ def test_a_planted_random_violation_with_a_known_probability():
 
 
 def test_an_episode_that_does_not_come_to_its_end_counts_as_a_violation():
-    (kept,) = charges(forced(soc_start=0.5), replace(NONE, soc_start=0.001), 1)
+    (kept,) = charges(forced(soc_start=0.5), ChargingRangeSettings(soc_start=(0.499, 0.501)), 1)
     ended = replace(kept, score=None, episode=kept.episode.cut(3, Ending.SOLVER, "no finite input"))
     found = figures([kept, ended], kept.score.tolerance, 0.95)
     assert (found["not_completed"], found["violations"], found["voltage_max_V.violations"]) == (1, 1, 0)
@@ -90,93 +98,138 @@ def test_an_episode_that_does_not_come_to_its_end_counts_as_a_violation():
 
 
 def test_quantiles_by_hand():
-    (one,) = charges(forced(soc_start=0.5), replace(NONE, soc_start=0.001), 1)
+    (one,) = charges(forced(soc_start=0.5), ChargingRangeSettings(soc_start=(0.499, 0.501)), 1)
     made = [replace(one, score=replace(one.score, metrics={**one.score.metrics, "t80_min": float(k)})) for k in range(1, 20)]
     never = replace(one, score=replace(one.score, metrics={**one.score.metrics, "t80_min": None}))
     found = figures([*made, never], one.score.tolerance, 0.95)
     assert [found[f"t80_min.{q}"] for q in ("q05", "q50", "q95", "worst")] == [1.0, 10.0, 19.0, None]
 
 
-def test_draws_are_within_the_spread_and_depend_on_seed_and_index_alone():
-    spread, problem = PlantVariation(), forced()
-    drawn = [spread.draw(problem, 3, index) for index in range(500)]
-    assert drawn[7] == PlantVariation().draw(problem, 3, 7) != PlantVariation().draw(problem, 4, 7)
-    start = np.array([d.soc_start for d in drawn])
-    age = np.array([d.age for d in drawn])
-    r0, capacity = (np.array([d.factors[name] for d in drawn]) for name in ("R0_ohm", "capacity_Ah"))
-    assert start.min() >= 0.57
-    assert start.max() <= 0.63
-    assert np.ptp(start) > 0.05
-    # Without the age, R0 is 1 +- 0.05 and the capacity 1 +- 0.02.
-    assert np.abs(r0 / (1 + 0.1 * age) - 1).max() <= 0.05
+def test_draws_are_within_the_default_range_and_depend_on_seed_and_index_alone():
+    problem = replace(forced(), range=default_range(forced()))
+    use = ChargingRange(problem)
+    drawn = [use.draw(1, charge_seed(3, index))[0] for index in range(500)]
+    assert use.draw(1, charge_seed(3, 7))[0].values == drawn[7].values != use.draw(1, charge_seed(4, 7))[0].values
+    starts = np.array([use.values(d)["soc_start"][0] for d in drawn])
+    age = np.array([d.values["age"][0] for d in drawn])
+    parameters = [dict(d.plant.model.parameters) for d in drawn]
+    nominal = dict(forced().cell.__dict__)
+    r0 = np.array([p["R0_ohm"] for p in parameters]) / nominal["R0_ohm"]
+    capacity = np.array([float(np.squeeze(p["capacity_Ah"])) for p in parameters]) / nominal["capacity_Ah"]
+    assert starts.min() >= 0.57
+    assert starts.max() <= 0.63
+    assert np.ptp(starts) > 0.05
+    # Without the age, each node of R0 is (1 +- 0.05)(1 +- 0.02) and the capacity 1 +- 0.02.
+    assert np.abs(r0 / (1 + 0.1 * age[:, None]) - 1).max() <= 1.05 * 1.02 - 1
     assert np.abs(capacity / (1 - 0.05 * age) - 1).max() <= 0.02
-    assert np.corrcoef(r0, age)[0, 1] > 0.5
+    assert np.corrcoef(r0[:, 0], age)[0, 1] > 0.5
     assert np.corrcoef(capacity, age)[0, 1] < -0.5
-    # Never a seed of a trial.
+    # The draws are independent of each other: no stratification within one sequence, no two alike, none that a trial could have.
     seeds = {d.seed for d in drawn}
-    assert len(seeds) == 500
-    assert not seeds & {trial_seed(s, n) for s in range(5) for n in range(200)}
+    assert len(seeds) == len(set(age)) == 500
+    assert abs(np.corrcoef(starts[:-1], starts[1:])[0, 1]) < 4 / math.sqrt(499)
+    # Shares below one half are binomial; a Sobol sequence would have exactly half of each 256 there.
+    counts = [(age[k : k + 16] < 0.5).sum() for k in range(0, 496, 16)]
+    assert 2 < np.var(counts) < 8
+    trials = {trial_seed(s, n) for s in range(5) for n in range(200)}
+    assert not ({charge_seed(s, k) for s in range(5) for k in range(200)} | seeds) & (trials | set(range(5)))
 
 
-def test_the_drawn_plant_differs_and_the_controller_does_not_know():
+def test_a_certificate_draws_what_no_search_and_no_trial_of_its_study_drew():
+    """The tuner draws from the study's seed and trials from theirs; the same seed of a certificate gives other plants."""
+    use = ChargingRange(replace(forced(), range=MODEST))
+    chosen_on = {d.values["soc_start"] for seed in (0, trial_seed(0, 0), trial_seed(0, 1)) for d in use.draw(64, seed)}
+    certified = {use.draw(1, charge_seed(0, index))[0].values["soc_start"] for index in range(64)}
+    assert len(certified) == 64
+    assert not certified & chosen_on
+
+
+def test_the_controller_does_not_know_the_plant():
     problem = forced(current_min_A=0.0, steps=60)
-    draw = PlantVariation().draw(problem, 0, 0)
-    harder = replace(draw, soc_start=0.6, factors={**dict.fromkeys(draw.factors, 1.0), "R0_ohm": 1.2})
-    same = replace(harder, factors=dict.fromkeys(draw.factors, 1.0))
-    variations = Variations(problem)
-    nominal = run_charge(problem, None)
-    np.testing.assert_allclose(variations.run(same, THETA)[1].input, nominal.input, atol=1e-6)
-    score, episode = variations.run(harder, THETA)
-    # A perfect model before; now R0 is a fifth larger than believed: about 0.2 x 61 mOhm x I more than the limit.
-    start, _ = episode.signal("voltage_V")
-    over = start.max() - 4.2
-    assert score.excess["voltage_max_V"] == pytest.approx(max(map(np.max, episode.signal("voltage_V"))) - 4.2)
-    assert over == pytest.approx(0.2 * 0.061 * episode.input[np.argmax(start), 0], rel=0.1)
-    # A larger capacity charges more slowly.
-    larger = replace(same, factors={**same.factors, "capacity_Ah": 1.1})
-    gained = [variations.run(d, THETA)[1].signal("soc")[1][0] - 0.6 for d in (same, larger)]
-    assert gained[0] / gained[1] == pytest.approx(1.1, rel=1e-6)
+    use = ChargingRange(replace(problem, range=ChargingRangeSettings(resistance=0.2, capacity=0.1)))
+    drawn = use.draw(32, 0)
+    nominal, _, _ = evaluate(problem, np.array(THETA), 0)
+    assert nominal.feasible
+    for one, episode in zip(drawn, use.run([np.array(THETA)] * 32, drawn), strict=True):
+        score = use.score(episode)
+        more = 1.0 + one.values["resistance"][0]
+        voltage = np.array(episode.signal("voltage_V"))
+        assert score.excess["voltage_max_V"] == pytest.approx(voltage.max() - 4.2)
+        # The model is perfect but for the resistance: what is more of it is over the limit, nothing else is.
+        assert score.feasible or more > 1.0
+        assert not score.feasible or more < 1.05
+        gained = episode.signal("soc")[1][0] - 0.6
+        expected = episode.input[0, 0] * episode.sampling_time_s / 3600 / (2.0 * (1 + one.values["capacity"][0]))
+        assert gained == pytest.approx(expected, rel=0.02)
 
 
-def test_an_electrochemical_plant_is_varied_and_another_is_refused():
-    with pytest.raises(ValueError, match="allowed are the cell's circuit and an electrochemical model"):
-        Variations(forced(plant=object()))
+def test_the_drawn_start_is_scored_from_there():
+    problem = forced(current_min_A=0.0, steps=60, backoff=Backoff(nodes=2, upper_V=0.02), voltage_noise_sd_V=1e-3)
+    (charge,) = charges(problem, ChargingRangeSettings(soc_start=(0.75, 0.75)), 1)
+    same = replace(problem, episode=replace(problem.episode, soc_start=0.75))
+    expected, other, _ = evaluate(same, np.array(THETA), charge.seed)
+    np.testing.assert_allclose(charge.episode.input, other.input, atol=1e-5)
+    assert charge.score.objective == pytest.approx(expected.objective, rel=1e-5)
+    assert charge.score.metrics["t80_min"] == pytest.approx(expected.metrics["t80_min"], rel=1e-4)
+
+
+def test_an_electrochemical_plant_is_varied():
+    known = Electrochemical("SPM", resistance_scale=1.2)
+    settings = ChargingRangeSettings(resistance=0.3, capacity=0.1, fade=0.2, growth=0.5, soc_start=(0.4, 0.6), voltage_bias_V=0.01)
+    use = ChargingRange(replace(forced(plant=known), range=settings))
+    for one in use.draw(32, 0):
+        plant, v = use.plant_of(one), use.values(one)
+        age, resistance, capacity = v["age"][0], v["resistance"][0], v["capacity"][0]
+        assert plant.settings.capacity_scale == pytest.approx((1 + capacity) * (1 - 0.2 * age))
+        assert plant.settings.resistance_scale == pytest.approx(max(1.0, 1.2 * (1 + resistance) * (1 + 0.5 * age)))
+        assert plant.settings.ambient_K == known.ambient_K
+        assert (plant.soc_start, plant.sensors.bias["voltage_V"]) == (v["soc_start"][0], v["voltage_bias_V"][0])
+    assert default_range(forced(plant=known)).names == ("soc_start", "resistance", "capacity", "fade", "growth")
+
+
+def test_an_electrochemical_plant_is_charged_and_certified(tmp_path):
     # A single particle that is charged for half a minute.
-    problem = forced(plant=Electrochemical("SPM"), steps=3, current_min_A=0.0, kalman=None)
-    one = PlantVariation().draw(problem, 0, 0)
-    plain, smaller, harder = (
-        Variations(problem).run(replace(one, soc_start=0.5, factors={**dict.fromkeys(one.factors, 1.0), **factors}), THETA)[1]
-        for factors in ({}, {"capacity_Ah": 0.8}, {"R0_ohm": 1.5})
-    )
-    current = np.array([episode.input[0, 0] for episode in (plain, smaller, harder)])
-    gained = np.array([episode.signal("soc")[1][0] - 0.5 for episode in (plain, smaller, harder)]) / current
-    assert gained[1] / gained[0] == pytest.approx(1 / 0.8, rel=1e-3)
-    assert harder.signal("voltage_V")[0][0] > plain.signal("voltage_V")[0][0] + 0.005
+    problem = forced(plant=Electrochemical("SPM"), steps=3, current_min_A=0.0)
+    problem = replace(problem, range=ChargingRangeSettings(soc_start=(0.4, 0.6), capacity=0.2, growth=0.5))
+    everything = [charge for portion in run_charges(problem, THETA, seed=0, episodes=2) for charge in portion]
+    # Different cells of different make: what is charged in the first interval follows the drawn capacity.
+    gained = [(c.episode.signal("soc")[1][0] - start(c)) / c.episode.input[0, 0] for c in everything]
+    capacity = [1 + c.values["capacity"][0] for c in everything]
+    assert gained[0] / gained[1] == pytest.approx(capacity[1] / capacity[0], rel=1e-3)
+    told = write_certificate(tmp_path / "c.json", problem, everything, theta={}, origin={}, seed=0, confidence=0.95)
+    assert "not varied: resistance_by_node, capacitance, capacitance_by_node" in told["drawn"]
+    assert verify(tmp_path / "c.json") == []
+
+
+@pytest.mark.parametrize(
+    ("plant", "settings", "words"),
+    [
+        (object(), NONE, "the cell's circuit or an electrochemical model"),
+        (Electrochemical("SPM"), ChargingRangeSettings(resistance_by_node=0.1), "resistance_by_node = 0.1, allowed is 0"),
+        (Electrochemical("SPM"), ChargingRangeSettings(capacitance=0.1), "capacitance = 0.1, allowed is 0"),
+    ],
+)
+def test_what_a_plant_cannot_vary_is_refused_by_name(plant, settings, words):
+    with pytest.raises(ValueError, match=words):
+        charges(forced(plant=plant), settings, 1)
 
 
 def test_nothing_to_draw_is_refused():
     with pytest.raises(ValueError, match="all episodes are the same"):
-        charges(forced(), NONE, 3)
+        charges(forced(), replace(NONE, soc_start=(0.5, 0.5)), 3)
+    with pytest.raises(ValueError, match="range = None"):
+        charges(forced(), None, 3)
     assert len(charges(forced(voltage_noise_sd_V=1e-3), NONE, 3)) == 3
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [({"fade": -0.1}, "fade"), ({"resistance": 1.0}, "resistance"), ({"soc_start": math.nan}, "soc_start")],
-)
-def test_a_bad_spread_is_refused(changes, words):
-    with pytest.raises(ValueError, match=f"spread: {words}"):
-        PlantVariation(**changes)
 
 
 @pytest.fixture
 def certificate(tmp_path):
-    problem = forced(voltage_noise_sd_V=0.002, soc_start=0.5)
+    problem = replace(forced(voltage_noise_sd_V=0.002, soc_start=0.5), range=MODEST)
     everything = charges(problem, MODEST, 12)
     path = tmp_path / "c.json"
     write_certificate(
         path, problem, everything, theta={"backoff_V[0]": 0.0, "backoff_V[1]": 0.0}, origin={"study": "s", "trial": 0},
-        spread=MODEST, seed=0, confidence=0.95,
+        seed=0, confidence=0.95,
     )  # fmt: skip
     return path
 
@@ -189,6 +242,32 @@ def test_a_true_certificate_is_verified_and_says_what_was_judged(certificate):
         # Judged without noise, kept as measured too.
         noise = archive["measured_end.voltage_V"] - archive["end.voltage_V"]
         assert noise.std() == pytest.approx(0.002, rel=0.25)
+        nodes = archive["drawn.capacitance_by_node"]
+    assert nodes.shape == (12, len(CELL.soc))
+    assert (stated["format"], stated["range"]["soc_start"], stated["range"]["fade"]) == ("chargetune certificate 2", [0.4, 0.6], 0.05)
+    assert set(stated["range"]) == set(stated["meaning"])
+
+
+def test_a_certificate_of_format_1_is_still_verified(tmp_path):
+    data = Path(__file__).parent / "data"
+    for file in data.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    path = tmp_path / "format-1.json"
+    assert verify(path) == []
+    original = path.read_text()
+    for name, value, found in (("spread", {"growth": 0.0}, "spread.resistance"), ("figures", {"violations": 1}, "violations")):
+        resealed(path, lambda stated, name=name, value=value: stated[name].update(value))
+        assert found in {d.name for d in verify(path)}
+        path.write_text(original)
+
+
+def test_a_trace_that_starts_elsewhere_than_drawn_is_named(certificate):
+    traces = traces_of(certificate)
+    with np.load(traces) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    arrays["drawn.soc_start"] = arrays["drawn.soc_start"] - 1e-4
+    np.savez_compressed(traces, **arrays)
+    assert {"drawn.soc_start", "soc_start"} <= {d.name for d in verify(certificate)}
 
 
 def traces_of(path):
@@ -225,8 +304,12 @@ def test_each_tampered_figure_is_named(certificate):
         (lambda c: c.update(confidence=0.5), {"violation_probability_upper"}),
         (lambda c: c["figures"].pop("violations"), {"violations"}),
         (lambda c: c["figures"].update(t50_min=3.0), {"t50_min"}),
-        (lambda c: c["spread"].update(resistance=0.0001), {"spread.resistance"}),
-        (lambda c: c["spread"].update(soc_start=0.001), {"spread.soc_start"}),
+        (lambda c: c["range"].update(resistance=0.0001), {"range.resistance"}),
+        (lambda c: c["range"].update(capacitance_by_node=0.01), {"range.capacitance_by_node"}),
+        (lambda c: c["range"].update(soc_start=[0.4, 0.45]), {"range.soc_start"}),
+        (lambda c: c["range"].update(soc_start=None), {"range.soc_start"}),
+        (lambda c: c["range"].update(fade=0.0), {"range.age"}),
+        (lambda c: c["range"].update(resistance_by_node=0.1), {"range.resistance_by_node"}),
         (lambda c: c["traces"].update(sha256="0" * 64), {"traces.sha256"}),
     ],
 )  # fmt: skip
@@ -271,34 +354,27 @@ def test_both_ways_to_the_bound_agree(violations, episodes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "width"),
+    ("changes", "interval"),
     [
-        ({"soc_start": 0.05, "soc_start_error": -0.04}, 0.03),
-        ({"soc_start": 0.6, "soc_start_error": 0.3, "soc_target": 1.0}, 0.3),
-        ({"soc_start": 0.6, "charge_time_to_soc": 0.65}, 0.2),
-        ({"soc_start": 0.85, "soc_target": 1.0, "voltage_max_V": 4.1}, 0.1),
+        ({"soc_start": 0.05, "soc_start_error": -0.04}, (0.0, 0.08)),
+        ({"soc_start": 0.6, "soc_start_error": 0.3, "soc_target": 1.0}, (0.3, 0.9)),
+        ({"soc_start": 0.85, "soc_target": 1.0, "voltage_max_V": 4.1}, (0.75, 0.95)),
     ],
 )
-def test_each_start_that_may_be_drawn_is_charged(changes, width):
-    """Drawn may be what no problem may state: an estimate beyond empty or full, a start past the mark, a cell at rest above its limit."""
+def test_each_start_that_may_be_drawn_is_charged(changes, interval):
+    """Drawn may be what no problem may state: a cell at rest above its limit."""
     problem = forced(current_min_A=0.0, backoff=Backoff(nodes=2, upper_V=0.02), **changes)
-    everything = charges(problem, replace(NONE, soc_start=width), 12)
-    starts = np.array([charge.draw.soc_start for charge in everything])
-    assert np.ptp(starts) > 0.5 * width
+    everything = charges(problem, ChargingRangeSettings(soc_start=interval), 12)
+    assert np.ptp([start(charge) for charge in everything]) > 0.3 * (interval[1] - interval[0])
     for charge in everything:
         assert charge.score is not None, charge.episode.message
 
 
-def test_the_drawn_start_is_scored_from_there():
-    problem = forced(current_min_A=0.0, steps=60, backoff=Backoff(nodes=2, upper_V=0.02))
-    draw = PlantVariation().draw(problem, 0, 0)
-    draw = replace(draw, soc_start=0.75, factors=dict.fromkeys(draw.factors, 1.0))
-    score, episode = Variations(problem).run(draw, THETA)
-    same = changed(problem, soc_start=0.75)
-    expected, other, _ = evaluate(same, np.array(THETA), draw.seed)
-    np.testing.assert_allclose(episode.input, other.input, atol=1e-6)
-    assert score.objective == pytest.approx(expected.objective, rel=1e-6)
-    assert score.metrics["t80_min"] == pytest.approx(expected.metrics["t80_min"], rel=1e-5)
+@pytest.mark.parametrize("changes", [{"soc_start": 0.0}, {"soc_start": 0.01}, {"soc_start": 0.6, "charge_time_to_soc": 0.601}])
+def test_the_default_range_fits_every_problem(changes):
+    problem = forced(current_min_A=0.0, backoff=Backoff(nodes=2, upper_V=0.02), **changes)
+    low, high = replace(problem, range=default_range(problem)).range.soc_start
+    assert 0.0 <= low <= high <= changes["soc_start"] + 0.03
 
 
 def killed(path, at, monkeypatch, everything):
@@ -319,8 +395,8 @@ def killed(path, at, monkeypatch, everything):
         patch.setattr(type(path), "unlink", step(type(path).unlink))
         try:
             write_certificate(
-                path, forced(voltage_noise_sd_V=0.002, soc_start=0.5), everything,
-                theta={"backoff_V[0]": 0.0, "backoff_V[1]": 0.0}, origin={"study": "s", "trial": 1}, spread=MODEST, seed=1, confidence=0.95,
+                path, replace(forced(voltage_noise_sd_V=0.002, soc_start=0.5), range=MODEST), everything,
+                theta={"backoff_V[0]": 0.0, "backoff_V[1]": 0.0}, origin={"study": "s", "trial": 1}, seed=1, confidence=0.95,
             )  # fmt: skip
         except SystemExit:
             return True

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
-__all__ = ["Row", "compare", "row_names"]
+__all__ = ["Row", "Verdict", "compare", "constant_backoff", "row_names", "smallest_that_keeps"]
 
 # Shares of the largest current: of CC-CV, and of five steps in five equal SOC windows.
 CCCV_SHARES = (0.25, 0.5, 1.0)
@@ -128,15 +129,30 @@ def _judged(problem: ChargingProblem, name: str, episode: Episode) -> Row:
 
 
 def _best_backoff(plain: ChargingProblem, name: str, seed: int) -> Row:
-    """The smallest constant voltage backoff with which no limit is broken, by bisection; the largest when none does it."""
+    tuned, largest = constant_backoff(plain)
+    return smallest_that_keeps(lambda value: _judged(plain, name, run_charge(tuned, [value, value], seed)), largest)
+
+
+def constant_backoff(plain: ChargingProblem) -> tuple[ChargingProblem, float]:
+    """The problem with a voltage backoff of two nodes, and the largest value that still lets the cell charge."""
     cell, highest = plain.cell, plain.voltage_max_V
     room = highest - float(np.interp(plain.episode.soc_start, cell.ocv_soc, cell.ocv_V))
     largest = min(BACKOFF_MAX_V, 0.9 * room)
-    tuned = replace(plain, theta=Tunables(backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest)))
+    return replace(plain, theta=Tunables(backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest))), largest
 
-    def run(value: float) -> Row:
-        return _judged(plain, name, run_charge(tuned, [value, value], seed))
 
+class Verdict(Protocol):
+    """What is known of a way of charging."""
+
+    @property
+    def breaks_limit(self) -> bool: ...
+
+
+T = TypeVar("T", bound=Verdict)
+
+
+def smallest_that_keeps(run: Callable[[float], T], largest: float) -> T:
+    """The run at the smallest value in [0, largest] with which no limit is broken, by bisection; at the largest when none does it."""
     low, high, best = 0.0, largest, run(largest)
     if best.breaks_limit:
         return best

@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +21,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.certification.clopper_pearson import violation_bound
-from chargetune.battery.certification.variations import MEANING, Draw, PlantVariation, Variations
+from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.metrics import SOC_MARKS
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.episode.episode import Episode
+from chargetune.battery.charging.range_settings import MEANING, NOT_ELECTROCHEMICAL
+from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
+from chargetune.plants.range_of_use import DrawnPlant
 from chargetune.study.files import write_whole
 from chargetune.study.provenance import utc_now, versions
 
-__all__ = ["FORMAT", "Charge", "figures", "run_charges", "write_certificate"]
+__all__ = ["FORMAT", "Charge", "charge_seed", "figures", "run_charges", "write_certificate"]
 
-FORMAT = "chargetune certificate 1"
+FORMAT = "chargetune certificate 2"
+DRAWN = (
+    "All values v are uniform and independent of each other, and each episode's of all others. The controller is told none of them: "
+    "it reads its sensors. Sensor noise is from a fresh seed."
+)
+DRAWN_ELECTROCHEMICAL = (
+    f"The plant is electrochemical: the resistance is its ohmic one at half charge, not below that of its parameter set; "
+    f"not varied: {', '.join(NOT_ELECTROCHEMICAL)}."
+)
 # Episodes that a worker runs at a time: the controller is built once for each.
 CHUNK = 25
 # Per cent, as integers: 0.95 x 20 must not round up.
@@ -43,32 +53,45 @@ class Charge:
     """One fresh episode: what was drawn, what happened, the verdict on it (None: it did not come to its end)."""
 
     index: int
-    draw: Draw
+    seed: int
+    values: Mapping[str, tuple[float, ...]]
     episode: Episode
     score: Score | None
+
+
+def charge_seed(seed: int, index: int) -> int:
+    """The seed of draw ``index``, of which it is the first: independent of all others and of every seed of a study.
+
+    Each charge has a sequence of its own, since the points of one Sobol sequence are not independent, and the bound wants that they are.
+    """
+    # A study's trials have spawn keys of one number.
+    state = np.random.SeedSequence(seed, spawn_key=(index, 1)).generate_state(1, np.uint64)
+    return int(state[0]) >> 11
 
 
 def run_charges(
     problem: ChargingProblem,
     theta: Sequence[float],
     *,
-    spread: PlantVariation,
     seed: int,
     episodes: int,
     executor: Executor | None = None,
 ) -> Iterator[list[Charge]]:
-    """The fresh episodes in portions, as they are done; their draws depend on seed and index alone.
+    """The fresh episodes on the problem's range of use in portions, as they are done; their draws depend on seed and index alone.
 
-    Raises ValueError when nothing is drawn that could differ, so that the episodes were all the same.
+    Raises ValueError without a range, and when nothing is drawn that could differ, so that the episodes were all the same.
     """
-    if not any(asdict(spread).values()) and not any(problem.sensors.noise_sd.values()):
-        raise ValueError("spread: everything is 0 and the sensors have no noise, so all episodes are the same; allowed is some spread")
+    ChargingRange(problem)
+    if problem.range is not None and not problem.range.names and not any(problem.sensors.noise_sd.values()):
+        raise ValueError(
+            "range: nothing differs and the sensors have no noise, so all episodes are the same; allowed is that something does"
+        )
     parts = [range(first, min(first + CHUNK, episodes)) for first in range(0, episodes, CHUNK)]
     if executor is None:
         for part in parts:
-            yield _portion(problem, tuple(theta), spread, seed, part)
+            yield _portion(problem, tuple(theta), seed, part)
         return
-    futures = [executor.submit(_portion, problem, tuple(theta), spread, seed, part) for part in parts]
+    futures = [executor.submit(_portion, problem, tuple(theta), seed, part) for part in parts]
     for future in as_completed(futures):
         yield future.result()
 
@@ -110,11 +133,10 @@ def write_certificate(
     *,
     theta: Mapping[str, float],
     origin: Mapping[str, Any],
-    spread: PlantVariation,
     seed: int,
     confidence: float,
 ) -> dict[str, Any]:
-    """Write both files and give the certificate. ``origin`` says which study and trial theta is from.
+    """Write both files and give the certificate. ``origin`` says which study and trial theta is from, and where the range is from.
 
     The traces' name holds their hash, ``NAME-0123456789ab.npz``, so that the certificate there was before keeps its own until the
     new one takes its place: a crash at any moment leaves the old one whole or the new one. Then the old traces are deleted. A
@@ -138,8 +160,9 @@ def write_certificate(
         "soc_target": problem.episode.soc_target,
         "seed": seed,
         "confidence": confidence,
-        "spread": asdict(spread),
+        "range": {} if problem.range is None else problem.range.entries,
         "meaning": MEANING,
+        "drawn": DRAWN if problem.plant is None else f"{DRAWN} {DRAWN_ELECTROCHEMICAL}",
         "judged": "true outputs, without sensor noise, at both ends of every interval",
         "limits": [
             {"name": limit.name, "signal": limit.signal, "upper": limit.upper, "bound": limit.bound, "tolerance": limit.tolerance}
@@ -168,14 +191,16 @@ def _traces_of(path: Path) -> Path | None:
     return path.with_name(name) if own else None
 
 
-def _portion(problem: ChargingProblem, theta: tuple[float, ...], spread: PlantVariation, seed: int, part: Sequence[int]) -> list[Charge]:
-    variations = Variations(problem)
-    out = []
-    for index in part:
-        draw = spread.draw(problem, seed, index)
-        score, episode = variations.run(draw, theta)
-        out.append(Charge(index, draw, episode, score))
-    return out
+def _portion(problem: ChargingProblem, theta: tuple[float, ...], seed: int, part: Sequence[int]) -> list[Charge]:
+    use = ChargingRange(problem)
+    drawn = [use.draw(1, charge_seed(seed, index))[0] for index in part]
+    episodes = use.run([np.array(theta)] * len(drawn), drawn)
+    return [_charge(use, index, one, episode) for index, one, episode in zip(part, drawn, episodes, strict=True)]
+
+
+def _charge(use: ChargingRange, index: int, drawn: DrawnPlant, episode: Episode) -> Charge:
+    score = use.score(episode.noise_free()) if episode.ending is Ending.DONE else None
+    return Charge(index, drawn.seed, use.values(drawn), episode, score)
 
 
 def _arrays(charges: Sequence[Charge]) -> dict[str, NDArray[Any]]:
@@ -187,10 +212,9 @@ def _arrays(charges: Sequence[Charge]) -> dict[str, NDArray[Any]]:
         "length": np.array([len(episode) for episode in episodes]),
         "completed": np.array([charge.score is not None for charge in charges]),
         "ending": np.array([f"{episode.ending.value} {episode.message}".strip() for episode in episodes]),
-        "soc_start": np.array([charge.draw.soc_start for charge in charges]),
-        "seed": np.array([charge.draw.seed for charge in charges]),
-        "age": np.array([charge.draw.age for charge in charges]),
-        **{f"factor.{name}": np.array([charge.draw.factors[name] for charge in charges]) for name in charges[0].draw.factors},
+        "soc_start": np.array([charge.values["soc_start"][0] for charge in charges]),
+        "seed": np.array([charge.seed for charge in charges]),
+        **{f"drawn.{name}": np.array([charge.values[name] for charge in charges]) for name in charges[0].values},
         "status": np.concatenate([episode.status for episode in episodes]),
     }
     for i, name in enumerate(episodes[0].input_names):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,13 @@ from numpy.typing import NDArray
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.problem import ChargingProblem, judged_exactly
-from chargetune.battery.charging.range_settings import ChargingRangeSettings
+from chargetune.battery.charging.range_settings import NOT_ELECTROCHEMICAL, ChargingRangeSettings
 from chargetune.battery.charging.verdict import NotMeasuredError, charge_samples, score_episode
+from chargetune.battery.plants.electrochemical import Electrochemical
+from chargetune.control.control_step import compiled_act
+from chargetune.plants.plant import Plant
 from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
+from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 from chargetune.plants.variation import Uniform, Variation
 
@@ -24,7 +28,7 @@ if TYPE_CHECKING:
     from chargetune.episode.episode import Episode
     from chargetune.episode.score import Score
 
-__all__ = ["ChargingRange", "range_of_use"]
+__all__ = ["ChargingRange", "electrochemical", "range_of_use"]
 
 # Metrics of a charge by which it breaks a limit, or is not solved.
 LARGEST = ("overshoot_mV", "overshoot_mVs", "violation_mVs", "current_max_excess_A", "temperature_max_K", "solver_failures")
@@ -61,16 +65,30 @@ def range_of_use(problem: ChargingProblem, settings: ChargingRangeSettings) -> R
         out.append(Variation("ambient", shift, parameters={"ambient_K": 1.0 / usual}, starts={"temperature_K": 1.0}, of="episode"))
     if settings.voltage_bias_V:
         bias = Uniform(-settings.voltage_bias_V, settings.voltage_bias_V)
-        out.append(Variation("voltage_bias", bias, biases={"voltage_V": 1.0}, of="episode"))
-    plant = SimulatedPlant(ecm_model(cell, problem.controller.sampling_time_s), start, problem.sensors.sensors())
+        out.append(Variation("voltage_bias_V", bias, biases={"voltage_V": 1.0}, of="episode"))
+    # Another plant may measure what the circuit does not have.
+    sensors = problem.sensors.sensors() if problem.plant is None else Sensors()
+    plant = SimulatedPlant(ecm_model(cell, problem.controller.sampling_time_s), start, sensors)
     return RangeOfUse(plant, tuple(out), {"soc": (0.0, 1.0)})
+
+
+def electrochemical(known: Electrochemical, settings: ChargingRangeSettings, values: Mapping[str, tuple[float, ...]]) -> Electrochemical:
+    """The plant with these values of its variations: capacity, ambient, and the ohmic resistance, which is at least the parameter set's."""
+    age, resistance, capacity = (values.get(name, (0.0,))[0] for name in ("age", "resistance", "capacity"))
+    return replace(
+        known,
+        resistance_scale=max(1.0, known.resistance_scale * (1 + resistance) * (1 + settings.growth * age)),
+        capacity_scale=known.capacity_scale * (1 + capacity) * (1 - settings.fade * age),
+        ambient_K=values.get("ambient_K", (known.ambient_K,))[0],
+    )
 
 
 @dataclass(frozen=True)
 class ChargingRange:
     """Charges of the problem's controller over its range of use (a `RangeLoop`), judged by the true outputs.
 
-    The controller is the same for all of them: what it knows of a start it measures.
+    The controller is the same for all of them: what it knows of a start it measures. Of an `Electrochemical` plant vary what
+    `electrochemical` says; what else the settings ask for is refused, and so is another plant: ValueError.
     """
 
     # A study's configuration is this problem already, so its identity does not hold it twice.
@@ -79,6 +97,19 @@ class ChargingRange:
     def __post_init__(self) -> None:
         if self.problem.range is None:
             raise ValueError("range = None, allowed is a table [range] that says what differs")
+        known, settings = self.problem.plant, self.problem.range
+        if known is None:
+            return
+        if not isinstance(known, Electrochemical):
+            raise ValueError(f"plant {known!r}: a range of use has the cell's circuit or an electrochemical model")
+        for name in NOT_ELECTROCHEMICAL:
+            if getattr(settings, name):
+                raise ValueError(
+                    f"range: {name} = {getattr(settings, name):g}, allowed is 0 for an electrochemical plant: it has no circuit"
+                )
+        # Refused before the first charge is an ambient that the plant may not have.
+        for ambient in settings.ambient_K or ():
+            replace(known, ambient_K=ambient)
 
     @property
     def largest_of(self) -> tuple[str, ...]:
@@ -90,8 +121,37 @@ class ChargingRange:
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         from chargetune.episode.episode import Ending
 
-        episodes = self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
-        return [e.noise_free() if e.ending is Ending.DONE else None for e in episodes]
+        return [e.noise_free() if e.ending is Ending.DONE else None for e in self.run(thetas, plants)]
+
+    def run(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode]:
+        """The episode of each theta on the plant of the same place as it was measured, however it ended."""
+        if self.problem.plant is None:
+            return self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
+        from chargetune.episode.stepwise import run_episode
+
+        controller, steps = controller_of(self.problem), self.problem.episode.steps
+        control = compiled_act(controller)
+        return [
+            run_episode(controller, self.plant_of(one), steps=steps, theta=theta, seed=one.seed, control=control)
+            for theta, one in zip(thetas, plants, strict=True)
+        ]
+
+    def plant_of(self, drawn: DrawnPlant) -> Plant:
+        """A new plant of this draw at its start."""
+        known, settings = self.problem.plant, self.problem.range
+        if not isinstance(known, Electrochemical) or settings is None:
+            return drawn.plant
+        values, sensors = self.values(drawn), self.problem.sensors.sensors()
+        bias = sensors.bias.get("voltage_V", 0.0) + values.get("voltage_bias_V", (0.0,))[0]
+        sensors = replace(sensors, bias={**sensors.bias, "voltage_V": bias})
+        return electrochemical(known, settings, values).plant(values["soc_start"][0], self.problem.controller.sampling_time_s, sensors)
+
+    def values(self, drawn: DrawnPlant) -> dict[str, tuple[float, ...]]:
+        """What was drawn, by names of the settings (fade and growth: age); always soc_start. By node one value a node."""
+        start, values = drawn.plant.start, dict(drawn.values)
+        if values.pop("ambient", None):
+            values["ambient_K"] = (start["temperature_K"],)
+        return {**values, "soc_start": (start["soc"],)}
 
     def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:
         start = float(episode.signal("soc")[0][0])

@@ -21,12 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluation_of", "make_tuner", "open_study"]
 
-# Fresh draws of a trial over a range of use: with none of 300 over a limit, at most 1 % are, with confidence 95 %.
-DRAWS = 300
-
 
 def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
-    """What a trial of this tuner is: one charge, or with "range" a theta on `DRAWS` fresh draws of the range of use."""
+    """What a trial of this tuner is: one charge, or with "range" a theta on fresh draws of the range of use."""
     return _over_range(problem) if name == "range" else Evaluation(problem)
 
 
@@ -37,7 +34,7 @@ def _over_range(problem: ChargingProblem) -> RangeEvaluation:
         raise ValueError("tuner = 'range' is given with [plant], allowed is the cell's own circuit, of which hundreds are drawn")
     from chargetune import learning
 
-    return learning.RangeEvaluation(ChargingRange(problem), DRAWS)
+    return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws)
 
 
 def make_tuner(

@@ -172,4 +172,4 @@ def _finish(figure: Figure, axis: Axes, view: StudyView, cell: Cell, handles: li
     axis.set_xlim(0.0, 100.0)
     axis.set_xlabel("SOC (%)")
     legend_above(figure, handles, columns=3)
-    cell_note(figure, cell.name, cell.remark)
+    cell_note(figure, cell.name, view.remark)

@@ -20,6 +20,7 @@ __all__ = ["failures", "limits", "opening", "provenance", "result", "sensitiviti
 
 def opening(view: StudyView) -> str:
     done = [t for t in view.trials if t.score is not None]
+    over = _plants_over(view.tuned)
     broke = sum(not t.feasible for t in done)
     failed = sum(t.status is TrialStatus.FAILED for t in view.trials)
     running = sum(t.status is TrialStatus.RUNNING for t in view.trials)
@@ -29,12 +30,20 @@ def opening(view: StudyView) -> str:
     if best is None:
         verdict = paragraph("No trial has a score: there is no result.", "bad")
     elif not best.feasible:
-        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits: {view.result.sentence}.", "bad")
+        verdict = paragraph(f"The result, trial {best.number}, did not keep the limits{over}: {view.result.sentence}.", "bad")
     else:
         why = f"Why this one: {view.result.sentence}."
-        verdict = paragraph(f"Result: trial {best.number}, which kept every limit. {_minutes(view)} {why}", "good")
+        verdict = paragraph(f"Result: trial {best.number}, which kept every limit{over}. {_minutes(view)} {why}", "good")
     note = '<p id="drawing">The figures are being drawn.</p>\n<noscript><p class="bad">The figures need JavaScript.</p></noscript>\n'
     return f"<header>\n<h1>{escape(view.name)}</h1>\n{paragraph(counts + more + '.', 'faint')}{verdict}{note}</header>\n<main>\n"
+
+
+def _plants_over(trial: Trial | None) -> str:
+    """Of a range of use: on how many of the drawn plants a limit was broken."""
+    drawn = {} if trial is None or trial.score is None else trial.score.metrics
+    if "plants" not in drawn:
+        return ""
+    return f" ({drawn['violating_plants']:.0f} of {drawn['plants']:.0f} drawn plants over a limit)"
 
 
 def _minutes(view: StudyView) -> str:
@@ -44,10 +53,12 @@ def _minutes(view: StudyView) -> str:
     tuned, untuned = t95(view.tuned), t95(view.untuned)
     if tuned is None:
         end = None if view.tuned is None or view.tuned.score is None else view.tuned.score.metrics.get("soc_end")
-        return "" if end is None else f"The charge ended at a state of charge of {100 * end:.1f} %."
+        ended = "The charges ended at a mean" if view.over_range else "The charge ended at a"
+        return "" if end is None else f"{ended} state of charge of {100 * end:.1f} %."
     kept = "kept the limits" if view.untuned is not None and view.untuned.feasible else "broke a limit"
     before = "" if untuned is None else f" Untuned it took {untuned:.2f} min and {kept}."
-    return f"95 % state of charge after {tuned:.2f} min.{before}"
+    mean = ", the mean of its plants" if view.over_range else ""
+    return f"95 % state of charge after {tuned:.2f} min{mean}.{before}"
 
 
 def what_was_tuned(view: StudyView) -> str:
@@ -58,6 +69,7 @@ def what_was_tuned(view: StudyView) -> str:
         control, charge = problem.controller, problem.episode
         seed = control.mismatch_seed
         belief = "the plant's own" if seed is None else f"wrong by the factors of mismatch seed {seed}"
+        start = "of the range of use" if view.over_range and problem.range and problem.range.soc_start else f"{charge.soc_start:g}"
         facts = [
             ("cell", problem.cell.name),
             ("capacity", f"{problem.cell.capacity_Ah:g} Ah"),
@@ -66,13 +78,15 @@ def what_was_tuned(view: StudyView) -> str:
             ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
             (
                 "charge",
-                f"SOC {charge.soc_start:g} to {charge.soc_target:g}, at most {charge.steps * control.sampling_time_s / 60:g} min",
+                f"SOC {start} to {charge.soc_target:g}, at most {charge.steps * control.sampling_time_s / 60:g} min",
             ),
             ("tuner", view.tuner),
         ]
+        if problem.range is not None:
+            facts.insert(-1, ("range of use", problem.range.line))
         parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts]))
-        if problem.cell.remark:
-            parts.append(paragraph(f"{problem.cell.name}: {problem.cell.remark}", "faint"))
+        if view.remark:
+            parts.append(paragraph(f"{problem.cell.name}: {view.remark}", "faint"))
         rows = [(x["name"], float(x["bound"]), x["unit"], float(x["tolerance"]), x["kind"]) for x in head["limits"]]
         parts.append(table(("limit", "bound", "unit", "tolerance", "in the controller"), rows))
     else:
@@ -101,8 +115,8 @@ def result(view: StudyView) -> str:
 
 
 def limits(view: StudyView) -> str:
-    title = "Limits, checked again from the stored traces"
-    if view.problem is None:
+    title, judged = "Limits, checked again from the stored traces", view.judged
+    if judged is None:
         stored = [(name, e, t) for name, e, t in _stored(view.tuned)]
         text = "What the limits mean is not in the study's document, so they cannot be judged again. The stored excess of the result:"
         return section(title, paragraph(text), table(("limit", "excess", "tolerance"), stored))
@@ -111,9 +125,8 @@ def limits(view: StudyView) -> str:
         if reading.episode is None:
             damaged.append(reading.message)
         else:
-            # The stored excess of a range of use is that of all its plants, the trace is that of one.
-            score = None if view.tuner == "range" else reading.trial.score
-            checks[reading.trial.number] = recheck(view.problem, reading.episode, score)
+            score = None if view.over_range else reading.trial.score
+            checks[reading.trial.number] = recheck(judged, reading.episode, score)
     parts = []
     for label, trial in (("untuned", view.untuned), (view.tuned_label, view.tuned)):
         if trial is not None and trial.number in checks:
@@ -122,6 +135,8 @@ def limits(view: StudyView) -> str:
     text = f"{len(checks)} trials with a trace were judged again; "
     if wrong:
         parts.append(paragraph(f"{text}in trials {', '.join(map(str, wrong))} the stored score says something else.", "bad"))
+    elif view.over_range:
+        parts.append(paragraph(f"{text}each trace is that of one drawn plant, the stored excesses are the worst of all of them."))
     else:
         parts.append(paragraph(f"{text}every stored excess is what its trace says."))
     parts += [paragraph(line, "bad") for line in damaged]
@@ -182,8 +197,9 @@ def failures(view: StudyView) -> str:
 def sensitivities(view: StudyView, moved: Sequence[Sensitivity]) -> str:
     parts = []
     if moved:
+        where = "on the drawn plants of the result" if view.over_range else "on the simulated plant at the result"
         text = (
-            f"Finite differences on the simulated plant at the result, with the seed of its trial: each entry of theta alone is moved by "
+            f"Finite differences {where}, with the seed of its trial: each entry of theta alone is moved by "
             f"{100 * STEP:g} % of its range, down and up. Where a bar is missing, the bound is nearer or the time is not reached."
         )
         parts.append(paragraph(text))
@@ -212,7 +228,7 @@ def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
         ]
         rows += [(f"made with {name}", str(v)) for name, v in best.provenance.get("versions", {}).items()]
         if reproduced and view.problem is not None:
-            off = again(view.problem, best)
+            off = again(view, best)
             rows.append(("evaluated again now, largest difference", "no score" if off is None else f"{off:.1e}"))
     others = {json.dumps(t.provenance.get("versions"), sort_keys=True) for t in view.trials}
     if len(others) > 1:

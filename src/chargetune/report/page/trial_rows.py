@@ -30,7 +30,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "created_at": "" if record is None else record.created_at,
         "tuner": view.tuner,
         "cell": "" if problem is None else problem.cell.name,
-        "remark": "" if problem is None else problem.cell.remark,
+        "remark": view.remark,
         "loss_label": loss_label(view),
         "excess_unit": unit,
         "tolerance": scale * allowed.pop() if len(allowed) == 1 and unit in ("mV", "unit of the limit") else None,

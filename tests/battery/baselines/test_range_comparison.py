@@ -1,0 +1,99 @@
+"""Ways of charging on drawn plants, against what is known of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from chargetune.battery.baselines.comparison import smallest_that_keeps
+from chargetune.battery.baselines.range_comparison import ORACLE, RangeRow, compare_range, range_row_names
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.cell.thermal import Thermal
+from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
+from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.charging.verdict import score_episode
+from charging_problems import charging_problem
+
+CELL = default_cell()
+USE = ChargingRangeSettings(soc_start=(0.3, 0.5), resistance=0.03, growth=0.05)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    problem = replace(charging_problem(CELL, mismatch_seed=None, horizon=3, steps=240, backoff=Backoff(nodes=2)), range=USE)
+    found = {row.name: row for row in compare_range(problem, [0.06, 0.06], draws=6)}
+    assert sorted(found) == sorted(range_row_names(problem, [0.06, 0.06]))
+    return found
+
+
+def test_what_knows_each_plant_keeps_its_limits_and_is_the_fastest(rows):
+    oracle, knowing = rows[ORACLE], rows["MPC that knows each plant"]
+    assert oracle.violations == knowing.violations == 0
+    # Two ways to the same: the largest current that keeps the voltage, and a controller with the drawn cell for a model.
+    assert oracle.mean("t80_min") == pytest.approx(knowing.mean("t80_min"), rel=5e-3)
+    assert abs(knowing.worst_excess("voltage_max_V")) < 5e-4
+    for name, row in rows.items():
+        assert len(row.scores) == 6
+        if not row.breaks_limit:
+            assert row.mean("t80_min") >= oracle.mean("t80_min") * (1 - 1e-4), name
+
+
+def test_the_controller_without_a_margin_breaks_the_limit_and_the_smallest_backoff_keeps_it_just(rows):
+    assert rows["nominal MPC"].violations > 0
+    best = rows["best constant backoff"]
+    assert best.violations == 0
+    # The search ends within 0.5 mV of the value where it breaks, which is the tolerance beyond the limit.
+    assert -6e-4 <= best.worst_excess("voltage_max_V") <= 5e-4
+    assert best.setting.endswith(" mV")
+    assert rows["tuned"].violations == 0
+    assert rows["tuned"].mean("t80_min") > best.mean("t80_min")
+    # CC-CV reads the voltage of each plant: without another limit its largest rate keeps it.
+    assert rows["CC-CV"].setting == "6 A"
+    assert rows["CC-CV"].mean("t80_min") == pytest.approx(rows[ORACLE].mean("t80_min"), rel=1e-9)
+
+
+def test_the_fastest_rate_is_that_of_the_hottest_plant():
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05))
+    problem = charging_problem(warm, mismatch_seed=None, horizon=3, steps=150, temperature_max_K=306.0, backoff=Backoff(nodes=2))
+    problem = replace(problem, range=ChargingRangeSettings(soc_start=(0.3, 0.5), resistance=0.2))
+    row = next(row for row in compare_range(problem, draws=4) if row.name == "CC-CV")
+    rate = float(row.setting.removesuffix(" A"))
+    assert row.violations == 0
+    assert 0.3 < rate < 5.9
+    assert -1.5 < row.worst_excess("temperature_max_K") <= 0.1
+
+
+def test_draws_are_the_same_for_every_row_and_depend_on_the_seed():
+    problem = replace(charging_problem(CELL, mismatch_seed=None, horizon=3, steps=240, backoff=Backoff(nodes=2)), range=USE)
+
+    def tuned(seed):
+        return next(row for row in compare_range(problem, [0.1, 0.1], draws=3, seed=seed) if row.name == "nominal MPC")
+
+    assert tuned(0) == tuned(0) != tuned(1)
+
+
+def test_figures_of_a_row_by_hand():
+    problem = charging_problem(CELL, mismatch_seed=1, horizon=3, steps=150)
+    score = score_episode(problem, run_charge(problem))
+    quick = replace(score, metrics={**score.metrics, "t80_min": 10.0}, excess={**score.excess, "voltage_max_V": -0.001})
+    slow = replace(quick, metrics={**score.metrics, "t80_min": 14.0}, excess={**score.excess, "voltage_max_V": 0.002})
+    row = RangeRow("a", (quick, slow))
+    assert (row.violations, row.mean("t80_min"), row.worst_excess("voltage_max_V")) == (1, 12.0, 0.002)
+    # A plant that never got there is in no mean, and so there is none.
+    ended = RangeRow("b", (quick, slow, None))
+    assert (ended.violations, ended.mean("t80_min")) == (2, None)
+
+
+@pytest.mark.parametrize(("edge", "expected"), [(-1.0, 0.0), (0.1, 0.1), (0.9, 0.3)])
+def test_the_smallest_value_is_found(edge, expected):
+    class Run:
+        def __init__(self, value):
+            self.value, self.breaks_limit = value, value < edge
+
+    assert smallest_that_keeps(Run, 0.3).value == pytest.approx(expected, abs=5e-4)
+
+
+def test_without_a_range_nothing_is_drawn():
+    with pytest.raises(ValueError, match="range = None"):
+        next(compare_range(charging_problem(CELL, backoff=Backoff(nodes=2)), np.zeros(2).tolist(), draws=2))

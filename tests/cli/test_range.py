@@ -1,0 +1,137 @@
+"""A study of the tuner "range" as a user runs it: tune, show, report, web, certify."""
+
+import json
+import re
+
+import pytest
+from commands import chargetune
+from starlette.testclient import TestClient
+
+from chargetune.report.figures.study_figures import figures_of
+from chargetune.report.page.trial_rows import study_head, trial_rows
+from chargetune.report.study_view import read_study
+from chargetune.verify import verify
+from chargetune.web.app import make_app
+from study_text import study_text
+
+RANGE = {"soc_start": [0.3, 0.5], "resistance": 0.1, "growth": 0.2, "draws": 12}
+TABLES = {
+    "study": {"name": "use", "tuner": "range", "trials": 2},
+    "controller": {"mismatch_seed": 1, "horizon": 3},
+    "episode": {"steps": 150, "soc_start": 0.4},
+    "sensors": {"voltage_noise_sd_V": 0.0005},
+    "theta.backoff": {"nodes": 2, "lower_V": 0.0, "upper_V": 0.2},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study of two thetas on twelve drawn plants each."""
+    path = tmp_path_factory.mktemp("range")
+    (path / "use.toml").write_text(study_text(**TABLES, range=RANGE))
+    (path / "tune.txt").write_text(chargetune("tune", path / "use.toml", "--store", path / "use.sqlite").stdout)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trials(folder):
+    return json.loads(chargetune("show", folder / "use.sqlite", "--study", "use", "--json").stdout)["trials"]
+
+
+def count(trial):
+    metrics = trial["metrics"]
+    return f"{metrics['violating_plants']:.0f} of {metrics['plants']:.0f}"
+
+
+def test_a_trial_is_a_theta_on_the_drawn_plants(folder, trials):
+    assert [t["metrics"]["plants"] for t in trials] == [12, 12]
+    for trial in trials:
+        over = trial["metrics"]["violating_plants"]
+        assert (over == 0) == trial["feasible"]
+        assert (max(trial["excess"].values()) > 0.0005) == (over > 0)
+        assert max(trial["theta"]) > 0.0
+    text = (folder / "tune.txt").read_text()
+    assert "drawn plants over a limit" in text
+
+
+def test_show_says_on_how_many_plants_a_limit_was_broken(folder, trials):
+    text = chargetune("show", folder / "use.sqlite", "--study", "use").stdout
+    assert "plants" in text
+    for trial in trials:
+        assert count(trial) in re.sub(r"\s+", " ", text)
+
+
+def test_the_report_speaks_of_the_range_and_evaluates_what_a_trial_is(folder, trials):
+    page = folder / "use.html"
+    chargetune("report", folder / "use.sqlite", "-o", page)
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page.read_text()))
+    assert "soc_start 0.3 to 0.5, resistance +-0.1, growth 0.2" in text
+    assert "SOC of the range of use to" in text
+    result = next(t for t in trials if f"trial {t['number']}" in text.partition("Why this one")[0])
+    assert f"({count(result)} drawn plants over a limit)" in text
+    assert "each trace is that of one drawn plant" in text
+    assert "every stored excess is what its trace says" not in text
+    assert "Finite differences on the drawn plants of the result" in text
+    # The same theta on the same draws is worth the same: a single charge of the nominal cell would not be.
+    again = re.search(r"evaluated again now, largest difference ([\d.e+-]+)", text)
+    assert float(again.group(1)) < 1e-9
+    view = read_study(folder / "use.sqlite", "use")
+    assert "trace that of the plant with the largest excess" in view.remark
+    assert set(figures_of(view)) == {"trajectories", "backoff", "convergence"}
+
+
+def test_the_live_pages_show_the_study(folder):
+    client = TestClient(make_app(folder / "use.sqlite"), base_url="http://127.0.0.1")
+    for path in ("/", "/studies/1"):
+        assert client.get(path).status_code == 200
+    drawing = client.get("/studies/1/trials/0").json()
+    assert {panel["key"] for panel in drawing["panels"]} >= {"soc", "voltage_V", "current_A"}
+    assert trial_rows(view := read_study(folder / "use.sqlite", "use"), view.trials)[0]["metrics"]["plants"] == 12
+    assert "trace that of the plant with the largest excess" in study_head(view)["remark"]
+
+
+def test_the_certificate_is_of_the_range_that_theta_was_tuned_for(folder):
+    path = folder / "c.json"
+    chargetune("certify", folder / "use.sqlite", "--episodes", 20, "--trial", 0, "-o", path)
+    told = json.loads(path.read_text())
+    assert told["origin"]["range"] == "the study's [range]"
+    given = {name: value for name, value in told["range"].items() if value}
+    assert given == {name: value for name, value in RANGE.items() if name != "draws"}
+    assert verify(path) == []
+    text = chargetune("certify", folder / "use.sqlite", "--episodes", 20, "--trial", 0, "--growth", 0, "-o", folder / "d.json").stdout
+    assert "range of use (the study's [range], with other growth): soc_start 0.3 to 0.5, resistance +-0.1" in re.sub(r"\s+", " ", text)
+    assert json.loads((folder / "d.json").read_text())["range"]["growth"] == 0
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({}, "tuner = 'range' is given without a table [range]"),
+        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with [plant]"),
+    ],
+)
+def test_a_range_that_cannot_be_tuned_is_refused(tables, words, tmp_path, refused):
+    path = tmp_path / "s.toml"
+    path.write_text(study_text(**TABLES, **tables))
+    assert words in refused("tune", path, "--store", tmp_path / "s.sqlite")
+
+
+def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
+    done = chargetune("compare", folder / "use.toml", "--store", folder / "use.sqlite", "--draws", 4, "--workers", 1, "--json")
+    told = json.loads(done.stdout)
+    rows = {row["name"]: row for row in told["rows"]}
+    assert list(rows) == ["CC-CV", "nominal MPC", "best constant backoff", "tuned", "MPC that knows each plant", "plant oracle"]
+    assert {row["draws"] for row in rows.values()} == {told["draws"]} == {4}
+    assert (rows["plant oracle"]["violations"], rows["plant oracle"]["ratio"]) == (0, 1.0)
+    assert told["range"]["soc_start"] == [0.3, 0.5]
+    assert told["result"]["trial"] in {t["number"] for t in trials}
+    text = chargetune("compare", folder / "use.toml", "--draws", 2, "--workers", 1).stdout
+    assert "The same 2 drawn plants in every row" in re.sub(r"\s+", " ", text)
+    assert "of 2" in text
+
+
+def test_compare_refuses_what_has_no_meaning_over_a_range(folder, tmp_path, refused):
+    assert "--figure is given for a study with a table [range]" in refused("compare", folder / "use.toml", "--figure", tmp_path / "a.pdf")
+    plain = tmp_path / "s.toml"
+    plain.write_text(study_text())
+    assert "--draws 3: allowed only for a study with a table [range]" in refused("compare", plain, "--draws", 3)
