@@ -172,7 +172,7 @@ def test_every_setting_may_be_a_run_time_value():
     values = {"noise": 0.1, "drift": 0.02, "first": 0.7, "gate": 3.0}
     own, rng = settable(**values), np.random.default_rng(4)
     measurements, inputs = rng.normal(size=(30, 1)), rng.normal(size=30)
-    named = ExtendedKalman(("y",), ("noise",), ("drift", lambda p: 2 * p["drift"]), ("first", 1.0), gate_sd="gate")
+    named = ExtendedKalman(("y",), ("noise",), ("drift", lambda p, u: 2 * p["drift"]), ("first", 1.0), gate_sd="gate")
     number = ExtendedKalman(("y",), (0.1,), (0.02, 0.04), (0.7, 1.0), gate_sd=3.0)
     correct, _ = functions(named, own)
     assert correct.size1_in(3) == 4

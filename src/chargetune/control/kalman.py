@@ -17,8 +17,8 @@ from chargetune.runtime.split import split
 
 __all__ = ["ExtendedKalman", "FilterMemory", "Setting"]
 
-# A number, the name of a scalar parameter of the model, or an expression of its parameters.
-Setting = float | str | Callable[[Named], Any]
+# A number, the name of a scalar parameter of the model, or an expression (p, u) of its parameters and the input of the interval.
+Setting = float | str | Callable[[Named, Named], Any]
 SETTINGS = ("measurement_sd", "process_sd", "start_sd", "gate_sd")
 
 
@@ -48,8 +48,9 @@ class ExtendedKalman:
     sensor's where no disturbance of the model stands for it: in fast charging the model error dominates. Outputs are processed one
     by one, which is exact for a diagonal R.
 
-    Each standard deviation is a number (compiled in), the name of a scalar model parameter, or an expression of the parameters: the
-    latter two are run-time values, and theta can set them.
+    Each standard deviation is a number (compiled in), the name of a scalar model parameter, or an expression (p, u) of parameters and the
+    input of the interval (that before the measurement; for process_sd that which follows): the latter two are run-time values, and
+    theta can set them.
 
     iterations
         Gauss-Newton iterations of each update: with more than one h is linearised again at the estimate, for bent outputs.
@@ -144,13 +145,13 @@ class ExtendedKalman:
         return FilterMemory(x, _symmetric(lower, sizes[0]), step, *counts)
 
     def correct(self, model: Model, memory: Any, y: Mapping[str, Any], u: Any, p: Any) -> tuple[Any, Any]:
-        nx, named = len(model.states), Named(model.parameter_blocks, p)
+        nx, named = len(model.states), (Named(model.parameter_blocks, p), _inputs(model, u))
         before = self.memory(model, memory)
-        begins, start = before.step < 0.5, self._values("start_sd", named)
+        begins, start = before.step < 0.5, self.values("start_sd", *named)
         prior, covariance = before.x, ca.if_else(begins, ca.diag(ca.vertcat(*start) ** 2), before.covariance)
         if self.first is not None:
-            prior = self._first(model, prior, y, named, begins)
-        noise = [sd**2 for sd in self._values("measurement_sd", named)]
+            prior = self._first(model, prior, y, named[0], begins)
+        noise = [sd**2 for sd in self.values("measurement_sd", *named)]
         at = ca.SX.sym("at", nx)
         outputs = model.h(at, u, p)
         outputs = ca.vertcat(*(outputs[model.output_names.index(name)] for name in self.measured))
@@ -185,15 +186,15 @@ class ExtendedKalman:
         before = self.memory(model, memory)
         at = ca.SX.sym("at", len(model.states))
         (transition,) = ca.substitute([ca.jacobian(model.f(at, u, p), at)], [at], [x_hat])
-        process = ca.vertcat(*self._values("process_sd", Named(model.parameter_blocks, p))) ** 2
+        process = ca.vertcat(*self.values("process_sd", Named(model.parameter_blocks, p), _inputs(model, u))) ** 2
         ahead = ca.mtimes([transition, before.covariance, transition.T]) + ca.diag(process)
         return ca.vertcat(model.f(x_hat, u, p), _lower(ahead), before.step, before.in_a_row, before.rejected, before.lost)
 
-    def _inside(self, y: Mapping[str, Any], p: Named, values: Any, rows: Any, covariance: Any, noise: list[Any]) -> list[Any]:
+    def _inside(self, y: Mapping[str, Any], named: tuple[Named, Named], values: Any, rows: Any, covariance: Any, noise: list[Any]) -> list[Any]:
         """Whether each sample is inside the gate."""
         if self.gate_sd is None:
             return [1] * len(self.measured)
-        (gate,) = self._values("gate_sd", p)
+        (gate,) = self.values("gate_sd", *named)
         variances = [ca.mtimes([rows[j, :], covariance, rows[j, :].T]) + noise[j] for j in range(len(self.measured))]
         return [(y[n] - values[j]) ** 2 <= gate**2 * variances[j] for j, n in enumerate(self.measured)]
 
@@ -209,12 +210,17 @@ class ExtendedKalman:
         value = getattr(self, name)
         return value if isinstance(value, tuple) else () if value is None else (value,)
 
-    def _values(self, name: str, p: Named) -> list[Any]:
-        return [ca.SX(p[v] if isinstance(v, str) else v(p) if callable(v) else v) for v in self._settings(name)]
+    def values(self, name: str, p: Named, u: Named) -> list[Any]:
+        """The expressions of measurement_sd, process_sd, start_sd or gate_sd."""
+        return [ca.SX(p[v] if isinstance(v, str) else v(p, u) if callable(v) else v) for v in self._settings(name)]
 
     def _sizes(self, model: Model) -> tuple[int, ...]:
         nx, ny = len(model.states), len(self.measured)
         return nx, nx * (nx + 1) // 2, 1, ny, ny, ny
+
+
+def _inputs(model: Model, u: Any) -> Named:
+    return Named(dict.fromkeys(model.input_names, 1), u)
 
 
 def _lower(matrix: Any) -> Any:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -12,7 +13,23 @@ from numpy.typing import ArrayLike
 from chargetune.model.detectability import check_setpoint
 from chargetune.model.model import Model, Named, Signal
 
-__all__ = ["with_disturbances"]
+__all__ = ["Ramp", "with_disturbances"]
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A disturbance d that changes steadily: d+ = a d + s r, r+ = exp(-|s| / decay) r, with its rate r as a further state.
+
+    s is the sampling time in s, or what ``along`` (u, p) says the disturbance changes with, such as the charge of an interval. ``decay``,
+    in the unit of s, is how far a rate reaches; None: for ever.
+    """
+
+    along: Callable[[Named, Named], Any] | None = None
+    decay: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.decay is not None and not _positive(self.decay):
+            raise ValueError(f"ramp: decay = {self.decay!r}, allowed is a finite number > 0")
 
 
 def with_disturbances(
@@ -21,6 +38,7 @@ def with_disturbances(
     outputs: Sequence[str] = (),
     inputs: Sequence[str] = (),
     parameters: Sequence[str] | Mapping[str, Sequence[str]] = (),
+    ramps: Mapping[str, Ramp] | None = None,
     time_constants_s: Mapping[str, float] | None = None,
     settings: Mapping[str, ArrayLike] | None = None,
     measured: Sequence[str] | None = None,
@@ -34,6 +52,9 @@ def with_disturbances(
     ``<input>_offset`` and ``<parameter>_log_factor``, the logarithm of a factor on a whole block of p. Where one factor is common to
     several blocks, ``parameters`` maps its name to theirs: {"resistance": ("R0_ohm", "R1_ohm")}.
 
+    ramps
+        Disturbance states that have a rate of change, a further state ``<state>_rate``: what changes steadily is then predicted without
+        lag, at the price of more noise. A decay is a scalar parameter ``<state>_rate_decay`` of the new model.
     time_constants_s
         By the name of a disturbance state, in s; each is a scalar parameter ``<state>_time_constant_s`` of the new model.
     settings
@@ -57,6 +78,9 @@ def with_disturbances(
         raise ValueError(f"disturbances of {model.name}: parameters = {factored}, allowed is one factor for each block")
     units = {s.name: s.unit for s in (*model.outputs, *model.inputs)}
     added = [Signal(f"{name}_offset", units[name]) for name in (*outputs, *inputs)] + [Signal(f"{name}_log_factor") for name in groups]
+    rates = dict(ramps or {})
+    _known(model, "ramps", tuple(rates), tuple(s.name for s in added))
+    added += [Signal(f"{s.name}_rate", "1" if rates[s.name].along else f"{s.unit}/s") for s in added if s.name in rates]
     names = [s.name for s in added]
     if not names:
         raise ValueError(f"disturbances of {model.name}: none is given, allowed is at least one output, input or parameter")
@@ -65,9 +89,10 @@ def with_disturbances(
     constants = dict(time_constants_s or {})
     _known(model, "time_constants_s", tuple(constants), tuple(names))
     for name, value in constants.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
+        if not _positive(value):
             raise ValueError(f"disturbances of {model.name}: time_constants_s of {name} = {value!r}, allowed is a finite number > 0")
-    more = {f"{name}_time_constant_s": value for name, value in constants.items()} | dict(settings or {})
+    decays = {f"{name}_rate_decay": ramp.decay for name, ramp in rates.items() if ramp.decay is not None}
+    more = {f"{name}_time_constant_s": value for name, value in constants.items()} | decays | dict(settings or {})
     if set(more) & set(blocks):
         taken = sorted(set(more) & set(blocks))
         raise ValueError(f"disturbances of {model.name}: settings {taken} are parameters of the model, allowed are new names")
@@ -83,6 +108,11 @@ def with_disturbances(
         for name in names:
             decay = ca.exp(-model.sampling_time_s / p[f"{name}_time_constant_s"]) if name in constants else 1
             following[name] = decay * x[name]
+        for name, ramp in rates.items():
+            rate, step = f"{name}_rate", ramp.along(u, p) if ramp.along else model.sampling_time_s
+            following[name] += step * x[rate]
+            if ramp.decay is not None:
+                following[rate] *= ca.exp(-ca.fabs(step) / p[f"{rate}_decay"])
         seen = {name: y[i] + (x[f"{name}_offset"] if name in outputs else 0) for i, name in enumerate(model.output_names)}
         return following, seen
 
@@ -98,6 +128,10 @@ def with_disturbances(
     if setpoint is not None:
         check_setpoint(built, model.output_names if measured is None else measured, setpoint)
     return built
+
+
+def _positive(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
 
 
 def _known(model: Model, field: str, names: Sequence[str], allowed: tuple[str, ...]) -> None:

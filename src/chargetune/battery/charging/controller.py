@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from chargetune.battery.cell.equivalent_circuit import ecm_model, overpotentials, start_state
 from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import HARD_FACTOR, Limit
-from chargetune.battery.charging.observers import Adaptive, OffsetFree, observer_filter, observer_model, settings_of
+from chargetune.battery.charging.observers import Adaptive, OffsetFree, observer_filter, observer_model, voltage_backoff
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.control.controller import Controller, SoftLimit, Stage
 from chargetune.control.estimators import Estimator, ExactState, Propagated
@@ -63,7 +63,7 @@ def _build(problem: ChargingProblem) -> Controller:
         parameters=believed,
         input_lower={"current_A": least},
         input_upper={"current_A": most},
-        limits=soft_limits(problem),
+        limits=soft_limits(problem, model),
         fallback={"current_A": max(least, 0.0)},
         setpoint={"soc": problem.episode.soc_target},
         start=start_state(problem.cell, problem.episode.soc_start + problem.estimator.soc_start_error),
@@ -86,12 +86,15 @@ def _filter_settings(problem: ChargingProblem) -> dict[str, float]:
     return {"voltage_sd_V": observer.voltage_sd_V} if isinstance(observer, Kalman) and problem.theta.voltage_sd else {}
 
 
-def soft_limits(problem: ChargingProblem) -> list[SoftLimit]:
-    """The limits that the controller sees, upper and lower bound of the same output together."""
-    theta = problem.theta
+def soft_limits(problem: ChargingProblem, model: Model) -> list[SoftLimit]:
+    """The limits that the controller sees, upper and lower bound of the same output together; ``model`` is its own."""
+    theta, observer = problem.theta, problem.estimator.settings
     margins: dict[str, Callable[[Stage], Any]] = {of: partial(part.margin, of) for of, part in theta.limit_backoffs.items()}
     if theta.backoff:
         margins["voltage"] = theta.backoff.voltage
+    if isinstance(observer, (OffsetFree, Adaptive)):
+        tuned, default = margins.get("voltage"), voltage_backoff(problem.cell, model, problem.current_max_A, observer)
+        margins["voltage"] = lambda stage: default(stage.u, stage.p) + (tuned(stage) if tuned else 0.0)
     bounds: dict[str, dict[str, Any]] = {}
     for limit in problem.limits_by_name.values():
         what = limit.of

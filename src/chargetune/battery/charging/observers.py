@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, Literal
 
 import casadi as ca
+import numpy as np
 
 from chargetune.battery.cell.cell import Cell
 from chargetune.battery.cell.equivalent_circuit import overpotentials
 from chargetune.battery.validation import check_number
 from chargetune.control.kalman import ExtendedKalman
-from chargetune.model.disturbances import with_disturbances
+from chargetune.control.riccati import steady_filter
+from chargetune.model.disturbances import Ramp, with_disturbances
 from chargetune.model.model import Model, Named
 from chargetune.model.splines import pchip
 
-__all__ = ["Adaptive", "OffsetFree", "observer_filter", "observer_model", "settings_of"]
+__all__ = ["Adaptive", "OffsetFree", "observer_filter", "observer_model", "settings_of", "voltage_backoff"]
 
 # Standard deviations of random walks are stated for a minute, so that they hold for any sampling time.
 MINUTE_S = 60.0
@@ -47,7 +49,9 @@ class OffsetFree:
     soc_from_rest: bool = True
     voltage_sd_V: float = 2e-3
     offset_start_sd_V: float = 5e-3
-    offset_drift_V: float = 8e-3
+    offset_drift_V: float = 3e-3
+    resistance_rate: float = 1.0
+    backoff_sd: float = 2.5
     soc_sd: float = 1e-3
     temperature_sd_K: float = 0.1
     temperature_drift_K: float = 0.5
@@ -74,12 +78,16 @@ class Adaptive:
     soc_from_rest: bool = True
     voltage_sd_V: float = 2e-3
     offset_start_sd_V: float = 5e-3
-    offset_drift_V: float = 4e-3
-    resistance_start_sd: float = 0.4
+    offset_drift_V: float = 2e-3
+    resistance_start_sd: float = 0.3
     resistance_drift: float = 0.05
-    overpotential_drift_V: float = 2e-3
+    resistance_rate_start_sd: float = 5.0
+    resistance_rate_drift: float = 12.0
+    resistance_rate_decay: float = 0.04
+    overpotential_drift_V: float = 1e-3
     soc_start_sd: float = 5e-3
     soc_drift: float = 1e-4
+    backoff_sd: float = 2.5
     soc_sd: float = 1e-3
     temperature_sd_K: float = 0.1
     temperature_drift_K: float = 0.5
@@ -98,7 +106,7 @@ def _check(table: str, observer: Observer, ways: tuple[str, ...]) -> None:
     if not isinstance(observer.soc_from_rest, bool):
         raise ValueError(f"{table}: soc_from_rest = {observer.soc_from_rest!r}, allowed is true or false")
     for name, value in settings_of(observer).items():
-        check_number(f"{table}: {name}", value, 0.0, 100.0, open_low=name in ("voltage_sd_V", "temperature_sd_K", "soc_sd", "gate_sd"))
+        check_number(f"{table}: {name}", value, 0.0, 1e4, open_low=name in ("voltage_sd_V", "temperature_sd_K", "soc_sd", "gate_sd"))
 
 
 def settings_of(observer: Observer) -> dict[str, float]:
@@ -110,7 +118,12 @@ def settings_of(observer: Observer) -> dict[str, float]:
 def observer_model(circuit: Model, observer: Observer) -> Model:
     """The circuit with the observer's disturbances; one for `Adaptive` has a parameter resistance_factor (`ecm_model`)."""
     factor = {"resistance": (RESISTANCE_FACTOR,)} if isinstance(observer, Adaptive) else {}
-    return with_disturbances(circuit, outputs=("voltage_V",), parameters=factor, settings=settings_of(observer))
+    ramps = {}
+    if isinstance(observer, Adaptive):
+        along = partial(_charge, sampling_time_s=circuit.sampling_time_s)
+        ramps["resistance_log_factor"] = Ramp(along, observer.resistance_rate_decay)
+    settings = {name: value for name, value in settings_of(observer).items() if name != "resistance_rate_decay"}
+    return with_disturbances(circuit, outputs=("voltage_V",), parameters=factor, ramps=ramps, settings=settings)
 
 
 def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKalman:
@@ -122,6 +135,8 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
 
     measurement: dict[str, Any] = {"voltage_V": "voltage_sd_V"}
     process: dict[str, Any] = {"voltage_V_offset": drift("offset_drift_V")}
+    if isinstance(observer, OffsetFree):
+        process["voltage_V_offset"] = partial(_offset_drift, cell=cell, sampling_time_s=model.sampling_time_s)
     start: dict[str, Any] = {"voltage_V_offset": "offset_start_sd_V"}
     if observer.soc == "measured":
         measurement["soc"], process["soc"], start["soc"] = "soc_sd", "soc_sd", "soc_sd"
@@ -129,7 +144,9 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
         measurement["temperature_K"], process["temperature_K"] = "temperature_sd_K", drift("temperature_drift_K")
         start["temperature_K"] = "temperature_sd_K"
     if isinstance(observer, Adaptive):
-        process["resistance_log_factor"], start["resistance_log_factor"] = drift("resistance_drift"), "resistance_start_sd"
+        for state, name in (("resistance_log_factor", "resistance"), ("resistance_log_factor_rate", "resistance_rate")):
+            process[state] = partial(_per_charge, name=f"{name}_drift", sampling_time_s=model.sampling_time_s)
+            start[state] = f"{name}_start_sd"
         process |= dict.fromkeys(overpotentials(cell), drift("overpotential_drift_V"))
         if observer.soc == "estimated":
             process["soc"], start["soc"] = drift("soc_drift"), "soc_start_sd"
@@ -138,8 +155,51 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
     return ExtendedKalman.of(model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, first=first)
 
 
-def _scaled(p: Named, name: str, share: float) -> Any:
+def voltage_backoff(cell: Cell, model: Model, current_max_A: float, observer: Observer) -> Callable[[Named, Named], Any]:
+    """(u, p) -> the default backoff of the voltage limit, V: backoff_sd standard deviations of the voltage one interval ahead.
+
+        b(I) = k (s(0) + (s(I_max) - s(0)) (I / I_max)^2)
+
+    with s(I) = sqrt(C P C') from the filter's Riccati equation at this current and half charge (`riccati.steady_filter`): noise that is
+    left, drift in one interval, and what the estimate lags behind. s is nearly quadratic: what is unknown of the resistances changes
+    by R I per SOC, and the SOC by I Ts. k = 2.5 is one sample in 160.
+    """
+    estimator = observer_filter(cell, model, observer)
+    x = np.zeros(len(model.states))
+    x[model.state_names.index("soc")] = 0.5
+    if cell.thermal:
+        x[model.state_names.index("temperature_K")] = cell.thermal.ambient_K
+    at_rest, at_most = (float(steady_filter(model, estimator, x, [current]).prediction_sd[0]) for current in (0.0, current_max_A))
+    return partial(_backoff, at_rest=at_rest, at_most=at_most, current_max_A=current_max_A)
+
+
+def _backoff(u: Named, p: Named, at_rest: float, at_most: float, current_max_A: float) -> Any:
+    return p["backoff_sd"] * (at_rest + (at_most - at_rest) * (u["current_A"] / current_max_A) ** 2)
+
+
+def _scaled(p: Named, u: Named, name: str, share: float) -> Any:
     return p[name] * share
+
+
+def _offset_drift(p: Named, u: Named, cell: Cell, sampling_time_s: float) -> Any:
+    """What an interval adds to the voltage's error, sd: a drift with time, and one of the resistances over the SOC, R I rate dz."""
+    with_current = p["resistance_rate"] * _resistance(p, cell) * u["current_A"] * _charge(u, p, sampling_time_s)
+    return ca.sqrt(p["offset_drift_V"] ** 2 * sampling_time_s / MINUTE_S + with_current**2)
+
+
+def _resistance(p: Named, cell: Cell) -> Any:
+    """Mean of the sum of all resistances over the SOC, in ohm."""
+    return sum(ca.sum1(p[name]) for name in cell.tables if name.startswith("R")) / len(cell.soc)
+
+
+def _charge(u: Named, p: Named, sampling_time_s: float) -> Any:
+    """The change of the SOC in an interval."""
+    return p["coulombic_efficiency"] * sampling_time_s / 3600 / p["capacity_Ah"] * u["current_A"]
+
+
+def _per_charge(p: Named, u: Named, name: str, sampling_time_s: float) -> Any:
+    """What a random walk over the SOC adds in an interval."""
+    return p[name] * ca.sqrt(ca.fabs(_charge(u, p, sampling_time_s)))
 
 
 def _soc_at_rest(y: Mapping[str, Any], p: Named, cell: Cell) -> dict[str, Any]:
