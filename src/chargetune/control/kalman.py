@@ -190,7 +190,9 @@ class ExtendedKalman:
         ahead = ca.mtimes([transition, before.covariance, transition.T]) + ca.diag(process)
         return ca.vertcat(model.f(x_hat, u, p), _lower(ahead), before.step, before.in_a_row, before.rejected, before.lost)
 
-    def _inside(self, y: Mapping[str, Any], named: tuple[Named, Named], values: Any, rows: Any, covariance: Any, noise: list[Any]) -> list[Any]:
+    def _inside(
+        self, y: Mapping[str, Any], named: tuple[Named, Named], values: Any, rows: Any, covariance: Any, noise: list[Any]
+    ) -> list[Any]:
         """Whether each sample is inside the gate."""
         if self.gate_sd is None:
             return [1] * len(self.measured)

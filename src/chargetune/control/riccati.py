@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from chargetune.control.kalman import ExtendedKalman
 from chargetune.model.model import Model, Named
@@ -27,10 +27,10 @@ class SteadyFilter:
     prediction_sd: NDArray[np.float64]
 
 
-def steady_filter(model: Model, estimator: ExtendedKalman, x: ArrayLike, u: ArrayLike) -> SteadyFilter:
+def steady_filter(model: Model, estimator: ExtendedKalman, x: NDArray[np.float64], u: NDArray[np.float64]) -> SteadyFilter:
     """The filter that has settled at a constant state and input, its settings as ``model.nominal`` has them.
 
-        P <- A (P - K C P) A' + Q,   K = P C' (C P C' + R)^-1,   prediction_sd = sqrt(diag(C P C'))
+    P <- A (P - K C P) A' + Q,   K = P C' (C P C' + R)^-1,   prediction_sd = sqrt(diag(C P C'))
     """
     names = estimator.signals(model)
     state, push, p = (ca.SX.sym(n, k) for n, k in (("x", len(model.states)), ("u", len(model.inputs)), ("p", model.nominal.size)))
@@ -42,9 +42,9 @@ def steady_filter(model: Model, estimator: ExtendedKalman, x: ArrayLike, u: Arra
     evaluate = ca.Function("parts", [state, push, p], [ca.densify(part) for part in parts])
     a, c, start, process, noise = (np.array(part) for part in evaluate(x, u, model.nominal))
     covariance, added, noise = np.diag(start.ravel() ** 2), np.diag(process.ravel() ** 2), np.diag(noise.ravel() ** 2)
-    gain = np.zeros((len(model.states), len(names)))
+    gain: NDArray[np.float64] = np.zeros((len(model.states), len(names)))
     for _ in range(STEPS):
-        gain = np.linalg.solve(c @ covariance @ c.T + noise, c @ covariance).T
+        gain = np.asarray(np.linalg.solve(c @ covariance @ c.T + noise, c @ covariance).T, dtype=np.float64)
         rest = np.eye(len(model.states)) - gain @ c
         covariance = a @ (rest @ covariance @ rest.T + gain @ noise @ gain.T) @ a.T + added
     return SteadyFilter(a, c, gain, np.sqrt(np.diag(c @ covariance @ c.T)))

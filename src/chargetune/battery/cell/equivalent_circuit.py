@@ -69,7 +69,7 @@ def ecm_model(
     def equations(x: Named, u: Named, p: Named) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         z, current = x["soc"], u["current_A"]
         factor = thermal.resistance_factor(x["temperature_K"], p["activation_J_mol"], p["reference_K"]) if thermal else 1
-        factor *= p["resistance_factor"] if "resistance_factor" in p else 1
+        factor *= p.get("resistance_factor", 1)
         following = {"soc": z + p["coulombic_efficiency"] * sampling_time_s / 3600 / p["capacity_Ah"] * current}
         polarised = table(z, p["R0_ohm"]) * factor * current
         for k, name in pairs.items():

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from chargetune.battery.charging.controller import controller_model, controller_of
 from chargetune.battery.charging.evaluate import evaluate, plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem, stand_in
+from chargetune.battery.charging.ringing import check_ringing
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_theta
@@ -60,6 +61,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
         found += weak or check_theta(lambda theta: _beyond(circuit, theta), circuit.space)
         if start is not None:
             found += check_theta(lambda theta: _beyond(circuit, theta), circuit.space, start)
+    found += check_ringing(circuit)
     if not quick:
         found += _plant_signs(problem)
     return tuple(sorted(found, key=lambda finding: finding.severity != "error"))

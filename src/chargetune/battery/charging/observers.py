@@ -33,13 +33,17 @@ RESISTANCE_FACTOR = "resistance_factor"
 class OffsetFree:
     """Offset-free MPC: the voltage's error of the model is a disturbance that the filter follows, constant over the horizon.
 
-    All are standard deviations; ``.._drift`` is what a random walk adds in a minute. The first measurement, at rest, sets the SOC through
-    the OCV (``soc_from_rest``; else the believed start does). From then on it is "counted", with the controller's own capacity, or
-    "measured". Overpotentials follow the controller's own model; a temperature is measured and filtered.
+    All but resistance_rate and backoff_sd are standard deviations; ``.._drift`` is what a random walk adds in a minute. The first
+    measurement, at rest, sets the SOC through the OCV (``soc_from_rest``; else the believed start does). From then on it is "counted",
+    with the controller's own capacity, or "measured". Overpotentials follow the controller's own model; a temperature is measured and filtered.
 
-    The steady-state gain K of the disturbance follows from r = voltage_sd_V and q = offset_drift_V sqrt(Ts / 60 s): K^2 / (1 - K) = q^2 / r^2.
-    At a voltage limit the closed loop rings where K R / R_believed is near 2, and does not overshoot where it is at most 1. The
-    defaults give K = 0.77 at 10 s and 0.39 at 1 s.
+    The variance that an interval adds to the disturbance is q^2 = offset_drift_V^2 Ts / 60 s + (R I resistance_rate dz)^2, the second
+    term for resistances whose relative error changes by resistance_rate over the whole SOC, dz the SOC of the interval and R the mean of
+    all resistances. The steady-state gain K follows from it and r = voltage_sd_V: K^2 / (1 - K) = q^2 / r^2. At a voltage limit the
+    current swings from sample to sample where K R / R_believed is above 1, and rings on near 2 (`check_ringing`).
+
+    backoff_sd
+        The default backoff of the voltage limit in standard deviations of the voltage one interval ahead (`voltage_backoff`); 0: none.
 
     gate_sd
         None: no gate. A resistance that is wrong by half looks like an outlier of tens of standard deviations.
@@ -50,8 +54,8 @@ class OffsetFree:
     voltage_sd_V: float = 2e-3
     offset_start_sd_V: float = 5e-3
     offset_drift_V: float = 3e-3
-    resistance_rate: float = 1.0
-    backoff_sd: float = 2.5
+    resistance_rate: float = 2.0
+    backoff_sd: float = 3.0
     soc_sd: float = 1e-3
     temperature_sd_K: float = 0.1
     temperature_drift_K: float = 0.5
@@ -68,7 +72,11 @@ class Adaptive:
     All are standard deviations; ``.._drift`` is what a random walk adds in a minute, ``.._start_sd`` is of the start. The first
     measurement, at rest, sets the SOC through the OCV (``soc_from_rest``). "estimated", the SOC is corrected by the voltage as well
     (then its start and drift count); "counted" and "measured" are as in `OffsetFree`. In steady state SOC and offset cannot be told
-    apart: their start and drift decide which of them a lasting difference is given to.
+    apart: their start and drift decide which of them a lasting difference is given to. resistance_drift and resistance_rate_drift are
+    random walks over the SOC, of the logarithm and of its rate of change; a rate reaches resistance_rate_decay of SOC far.
+
+    backoff_sd
+        As in `OffsetFree`.
 
     gate_sd
         Samples further off than so many standard deviations of the innovation are left out, at most ten in a row.
@@ -87,7 +95,7 @@ class Adaptive:
     overpotential_drift_V: float = 1e-3
     soc_start_sd: float = 5e-3
     soc_drift: float = 1e-4
-    backoff_sd: float = 2.5
+    backoff_sd: float = 3.0
     soc_sd: float = 1e-3
     temperature_sd_K: float = 0.1
     temperature_drift_K: float = 0.5
@@ -162,14 +170,14 @@ def voltage_backoff(cell: Cell, model: Model, current_max_A: float, observer: Ob
 
     with s(I) = sqrt(C P C') from the filter's Riccati equation at this current and half charge (`riccati.steady_filter`): noise that is
     left, drift in one interval, and what the estimate lags behind. s is nearly quadratic: what is unknown of the resistances changes
-    by R I per SOC, and the SOC by I Ts. k = 2.5 is one sample in 160.
+    by R I per SOC, and the SOC by I Ts. k = 3 is one sample in 740.
     """
     estimator = observer_filter(cell, model, observer)
     x = np.zeros(len(model.states))
     x[model.state_names.index("soc")] = 0.5
     if cell.thermal:
         x[model.state_names.index("temperature_K")] = cell.thermal.ambient_K
-    at_rest, at_most = (float(steady_filter(model, estimator, x, [current]).prediction_sd[0]) for current in (0.0, current_max_A))
+    at_rest, at_most = (float(steady_filter(model, estimator, x, np.array([current])).prediction_sd[0]) for current in (0.0, current_max_A))
     return partial(_backoff, at_rest=at_rest, at_most=at_most, current_max_A=current_max_A)
 
 
@@ -177,7 +185,7 @@ def _backoff(u: Named, p: Named, at_rest: float, at_most: float, current_max_A: 
     return p["backoff_sd"] * (at_rest + (at_most - at_rest) * (u["current_A"] / current_max_A) ** 2)
 
 
-def _scaled(p: Named, u: Named, name: str, share: float) -> Any:
+def _scaled(p: Named, _: Named, name: str, share: float) -> Any:
     return p[name] * share
 
 
@@ -202,14 +210,14 @@ def _per_charge(p: Named, u: Named, name: str, sampling_time_s: float) -> Any:
     return p[name] * ca.sqrt(ca.fabs(_charge(u, p, sampling_time_s)))
 
 
-def _soc_at_rest(y: Mapping[str, Any], p: Named, cell: Cell) -> dict[str, Any]:
+def _soc_at_rest(y: Mapping[str, Any], _: Named, cell: Cell) -> dict[str, Any]:
     """The SOC whose OCV is the voltage at rest, within 0 and 1: from the inverse table by Newton steps on the table itself."""
     voltage = ca.fmin(ca.fmax(y["voltage_V"], cell.ocv_V[0]), cell.ocv_V[-1])
     z = ca.SX.sym("z")
     ocv = pchip(z, cell.ocv_soc, cell.ocv_V)
     step = ca.Function("newton", [z], [ocv, ca.jacobian(ocv, z)])
     soc = pchip(voltage, cell.ocv_V, cell.ocv_soc)
-    for _ in range(NEWTON_STEPS):
+    for _step in range(NEWTON_STEPS):
         value, slope = step(soc)
         soc = ca.fmin(ca.fmax(soc + (voltage - value) / ca.fmax(slope, 1e-3), 0.0), 1.0)
     # A sample that is lost says nothing: fmin and fmax would drop the nan.

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.validation import check_count, check_number
 from chargetune.plants.sensors import Sensors
 
-__all__ = ["ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
+__all__ = ["FILTERS", "ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,10 @@ class ControllerSettings:
             check_number("current_ramp_A_s", self.current_ramp_A_s, 0.0, 1e4, "A/s", open_low=True)
 
 
+Kind = Literal["open_loop", "exact", "kalman", "offset_free", "adaptive"]
+FILTERS = ("kalman", "offset_free", "adaptive")
+
+
 @dataclass(frozen=True)
 class EstimatorSettings:
     """What the controller knows of the state, and how.
@@ -49,14 +53,14 @@ class EstimatorSettings:
         model, and the voltage is not read. That is the paper's controller. "exact": every state of the circuit is the plant's, which no
         real cell tells. "kalman": a filter on voltage and temperature estimates SOC and overpotentials (`Kalman`). "offset_free": the
         voltage's error is a disturbance that a filter follows, the SOC is counted (`OffsetFree`). "adaptive": the same with a
-        common factor of the resistances (`Adaptive`).
+        common factor of the resistances (`Adaptive`). None: that whose settings are given, else open_loop.
     soc_start_error
         What is believed of the SOC at the start less the truth; no more than a guess where the voltage at rest sets it.
     kalman, offset_free, adaptive
         The settings of the kind of that name; None: its defaults.
     """
 
-    kind: Literal["open_loop", "exact", "kalman", "offset_free", "adaptive"] = "open_loop"
+    kind: Kind | None = None
     soc_start_error: float = 0.0
     kalman: Kalman | None = None
     offset_free: OffsetFree | None = None
@@ -64,12 +68,14 @@ class EstimatorSettings:
 
     def __post_init__(self) -> None:
         check_number("soc_start_error", self.soc_start_error, -0.5, 0.5)
-        kinds = ("open_loop", "exact", "kalman", "offset_free", "adaptive")
-        if self.kind not in kinds:
-            raise ValueError(f"estimator: kind = {self.kind!r}, allowed are {', '.join(kinds)}")
-        given = [name for name in ("kalman", "offset_free", "adaptive") if getattr(self, name) is not None and name != self.kind]
+        named = [name for name in FILTERS if getattr(self, name) is not None]
+        if self.kind is None:
+            object.__setattr__(self, "kind", named[0] if named else "open_loop")
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"estimator: kind = {self.kind!r}, allowed are {', '.join(get_args(Kind))}")
+        given = [name for name in named if name != self.kind]
         if given:
-            raise ValueError(f"estimator: settings of {', '.join(given)} are given with kind = {self.kind!r}, allowed are those of the kind")
+            raise ValueError(f"estimator: settings of {', '.join(given)} are given with kind = {self.kind!r}, allowed are its own")
 
     @property
     def settings(self) -> Kalman | OffsetFree | Adaptive | None:
