@@ -35,7 +35,8 @@ class OffsetFree:
 
     All but resistance_rate and backoff_sd are standard deviations; ``.._drift`` is what a random walk adds in a minute. The first
     measurement, at rest, sets the SOC through the OCV (``soc_from_rest``; else the believed start does). From then on it is "counted",
-    with the controller's own capacity, or "measured". Overpotentials follow the controller's own model; a temperature is measured and filtered.
+    with the controller's own capacity, or "measured". Overpotentials follow the controller's
+    own model; a temperature is measured and filtered.
 
     The variance that an interval adds to the disturbance is q^2 = offset_drift_V^2 Ts / 60 s + (R I resistance_rate dz)^2, the second
     term for resistances whose relative error changes by resistance_rate over the whole SOC, dz the SOC of the interval and R the mean of
