@@ -25,7 +25,7 @@ from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.evaluate import plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.settings import ControllerSettings, EpisodeSettings
+from chargetune.battery.charging.settings import ControllerSettings, EpisodeSettings, EstimatorSettings
 from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.episode.compiled import compiled_episode
 
@@ -36,17 +36,17 @@ import time
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.settings import ControllerSettings
+from chargetune.battery.charging.settings import ControllerSettings, EstimatorSettings
 begin = time.perf_counter()
-run_charge(ChargingProblem(default_cell(), controller=ControllerSettings(mismatch_seed=0, overpotential="exact")))
+run_charge(ChargingProblem(default_cell(), controller=ControllerSettings(mismatch_seed=0), estimator=EstimatorSettings(kind="exact")))
 print(time.perf_counter() - begin)
 """
 
 
-def problem(seed, overpotential="exact", horizon=5, **tables):
+def problem(seed, kind="exact", horizon=5, **tables):
     """P0 for one wrong model."""
     return ChargingProblem(
-        default_cell(), controller=ControllerSettings(horizon=horizon, mismatch_seed=seed, overpotential=overpotential), **tables
+        default_cell(), controller=ControllerSettings(horizon=horizon, mismatch_seed=seed), estimator=EstimatorSettings(kind=kind), **tables
     )
 
 
@@ -75,7 +75,7 @@ def set_up():
 
 def failures():
     """Control steps that missed the program's own optimality test, over 20 wrong models and both ways to know U1."""
-    return sum(run_charge(problem(seed, treatment)).failures for seed in range(20) for treatment in ("exact", "model"))
+    return sum(run_charge(problem(seed, treatment)).failures for seed in range(20) for treatment in ("exact", "open_loop"))
 
 
 def run_chunk(own, thetas):

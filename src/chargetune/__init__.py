@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from chargetune.battery.studies.open_study import open_study
     from chargetune.battery.studies.study_file import load_config
     from chargetune.control.controller import Controller, SoftLimit, Stage
-    from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+    from chargetune.control.estimators import ExactState, Propagated
+    from chargetune.control.kalman import ExtendedKalman
     from chargetune.episode.compiled import simulate
     from chargetune.episode.episode import Ending, Episode, Trip
     from chargetune.episode.score import Score
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from chargetune.learning.twin.simulated_twin import SimulatedTwin
     from chargetune.learning.twin.twin import Twin, Uncertain
     from chargetune.learning.twin_tuner import TwinTuner
+    from chargetune.model.disturbances import with_disturbances
     from chargetune.model.do_mpc import from_do_mpc
     from chargetune.model.integrators import rk4
     from chargetune.model.model import Model, Signal
@@ -104,6 +106,7 @@ __all__ = [
     "run_episode",
     "score_limits",
     "simulate",
+    "with_disturbances",
 ]
 
 # A literal, not importlib.metadata: reading the metadata costs a tenth of the time that ``chargetune --help`` may take.
@@ -120,7 +123,7 @@ _MODULES = {
     "Evaluation": "episode.score_limits",
     "ExactState": "control.estimators",
     "ExpectedImprovement": "learning.black_box.expected_improvement",
-    "ExtendedKalman": "control.estimators",
+    "ExtendedKalman": "control.kalman",
     "GymnasiumPlant": "plants.gymnasium",
     "IterativeLearning": "learning.closed_loop.iterative_learning",
     "LogNormal": "plants.variation",
@@ -163,6 +166,7 @@ _MODULES = {
     "run_episode": "episode.stepwise",
     "score_limits": "episode.score_limits",
     "simulate": "episode.compiled",
+    "with_disturbances": "model.disturbances",
 }
 
 

@@ -19,7 +19,7 @@ from charging_problems import charging_problem
 @pytest.fixture(scope="module")
 def oracle():
     """The case study's controller with a measured overpotential, which knows the cell."""
-    return controller_of(charging_problem(default_cell(), mismatch_seed=None, overpotential="exact"))
+    return controller_of(charging_problem(default_cell(), mismatch_seed=None, kind="exact"))
 
 
 def run(controller, steps=300):

@@ -6,7 +6,7 @@ from systems import SPACE, controller, plant_model
 
 from chargetune.control.control_step import act, compiled_act
 from chargetune.control.controller import SoftLimit
-from chargetune.control.estimators import ExtendedKalman
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
 

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.control.estimators import ExactState, Propagated
 from chargetune.model.model import Model, Signal
 
 A = np.array([[1.0, 0.1], [-0.2, 0.9]])
@@ -33,43 +33,10 @@ def linear():
 def functions(estimator, own):
     names = estimator.signals(own)
     memory = ca.SX.sym("m", estimator.initial(own, np.zeros(2)).size)
-    y, u, x, p = ca.SX.sym("y", len(names)), ca.SX.sym("u", 1), ca.SX.sym("x", 2), ca.SX.sym("p", 0)
+    y, u, x, p = ca.SX.sym("y", len(names)), ca.SX.sym("u", 1), ca.SX.sym("x", 2), ca.SX.sym("p", own.nominal.size)
     x_hat, corrected = estimator.correct(own, memory, {n: y[i] for i, n in enumerate(names)}, u, p)
     correct = ca.Function("correct", [memory, y, u, p], [x_hat, corrected])
     return correct, ca.Function("predict", [x, memory, u, p], [estimator.predict(own, x, memory, u, p)])
-
-
-@pytest.mark.parametrize("measured", [("y",), ("y", "w")])
-def test_kalman_filter_is_the_textbook_one_on_a_linear_system(measured):
-    own = linear()
-    sd, process, initial = (0.1, 0.2)[: len(measured)], (0.02, 0.03), (1.0, 2.0)
-    estimator = ExtendedKalman(measured, sd, process, initial)
-    correct, predict = functions(estimator, own)
-    rng = np.random.default_rng(0)
-    memory = estimator.initial(own, np.array([0.5, -0.5]))
-    x, covariance = np.array([0.5, -0.5]), np.diag(np.square(initial))
-    c, d = C[: len(measured)], D[: len(measured)]
-    last = 0.0
-    for _ in range(20):
-        y, u = rng.normal(size=len(measured)), rng.normal()
-        gain = covariance @ c.T @ np.linalg.inv(c @ covariance @ c.T + np.diag(np.square(sd)))
-        x = x + gain @ (y - c @ x - d * last)
-        covariance = (np.eye(2) - gain @ c) @ covariance
-        x_hat, corrected = correct(memory, y, last, [])
-        np.testing.assert_allclose(np.array(x_hat).ravel(), x, atol=1e-10)
-        memory = predict(x_hat, corrected, u, [])
-        x, covariance = A @ x + B * u, A @ covariance @ A.T + np.diag(np.square(process))
-        np.testing.assert_allclose(np.array(memory).ravel(), [*x, *covariance.ravel(order="F")], atol=1e-10)
-        last = u
-
-
-def test_kalman_filter_leaves_out_a_sample_that_is_no_number():
-    own = linear()
-    estimator = ExtendedKalman(("y", "w"), (0.1, 0.2), (0.02, 0.03), (1.0, 2.0))
-    only = ExtendedKalman(("w",), (0.2,), (0.02, 0.03), (1.0, 2.0))
-    memory = estimator.initial(own, np.array([0.5, -0.5]))
-    both, one = functions(estimator, own)[0], functions(only, own)[0]
-    np.testing.assert_allclose(np.array(both(memory, [np.nan, 0.3], 0.0, [])[1]), np.array(one(memory, [0.3], 0.0, [])[1]), atol=1e-12)
 
 
 def test_propagated_states_follow_the_model_and_measured_ones_the_plant():
@@ -95,12 +62,6 @@ def test_exact_state_is_what_was_measured():
     ("make", "words"),
     [
         (lambda: Propagated(("z",)).signals(linear()), ["'z'", "a, b"]),
-        (lambda: ExtendedKalman(("q",), (0.1,), (0, 0), (1, 1)).signals(linear()), ["'q'", "y, w"]),
-        (lambda: ExtendedKalman(("y",), (0.1,), (0,), (1, 1)).signals(linear()), ["process_sd", "1 values"]),
-        (lambda: ExtendedKalman(("y",), (0.1, 0.2), (0, 0), (1, 1)), ["measurement_sd", "2 values"]),
-        (lambda: ExtendedKalman(("y",), (0.0,), (0, 0), (1, 1)), ["measurement_sd", "> 0"]),
-        (lambda: ExtendedKalman(("y",), (0.1,), (-1, 0), (1, 1)), ["process_sd", ">= 0"]),
-        (lambda: ExtendedKalman((), (), (0, 0), (1, 1)), ["measurement_sd"]),
     ],
 )
 def test_refusals(make, words):

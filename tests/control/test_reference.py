@@ -44,8 +44,8 @@ def cases(shared):
 
 def problem_of_case(case):
     seed = None if case["name"] == "oracle" else int(case["name"][4])
-    treatment = "exact" if case["U1"] == "measured" else "model"
-    return charging_problem(default_cell(), mismatch_seed=seed, backoff=Backoff(7), overpotential=treatment, c1=1e-4)
+    kind = "exact" if case["U1"] == "measured" else "open_loop"
+    return charging_problem(default_cell(), mismatch_seed=seed, backoff=Backoff(7), kind=kind, c1=1e-4)
 
 
 def test_no_case_is_forgotten(cases):

@@ -8,7 +8,7 @@ import pytest
 from systems import controller, plant_model
 
 from chargetune.control.control_step import problem_of
-from chargetune.control.estimators import ExtendedKalman
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.stepwise import run_episode

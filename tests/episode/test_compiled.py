@@ -13,7 +13,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.evaluate import plant_of
-from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.control.estimators import ExactState, Propagated
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
 from chargetune.episode.lookup_table import LookupTable

@@ -9,8 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from chargetune.control.controller import Controller, SoftLimit
-from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.control.estimators import ExactState, Propagated
 from chargetune.control.ipopt_reference import ipopt_act
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.compiled import simulate
 from chargetune.episode.episode import Ending
 from chargetune.episode.stepwise import run_episode

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.evaluate import plant_of
 from chargetune.control.control_step import act
-from chargetune.control.estimators import ExactState, ExtendedKalman, Propagated
+from chargetune.control.estimators import ExactState, Propagated
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Trip
 from chargetune.episode.stepwise import run_episode, signal_indices

@@ -7,7 +7,6 @@ applied, using the controller's OWN model. Before the first measurement the memo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -16,10 +15,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.model.model import Model, Named
-from chargetune.runtime.split import split
+from chargetune.model.model import Model
 
-__all__ = ["Estimator", "ExactState", "ExtendedKalman", "Propagated", "finite"]
+__all__ = ["Estimator", "ExactState", "Propagated", "finite"]
 
 
 def finite(value: Any) -> Any:
@@ -89,78 +87,3 @@ class Propagated:
 
     def predict(self, model: Model, x_hat: Any, memory: Any, u: Any, p: Any) -> Any:
         return model.f(x_hat, u, p)
-
-
-@dataclass(frozen=True)
-class ExtendedKalman:
-    """Extended Kalman filter on the ``measured`` outputs of the controller's model.
-
-    With A = df/dx, C = dh/dx at the prediction, R = diag(measurement_sd^2), Q = diag(process_sd^2) per interval:
-    K = P C' (C P C' + R)^-1, x_hat = x + K (y - h(x, u)), P = (I - K C) P, then x = f(x_hat, u), P = A P A' + Q.
-    The measurement of index k is the output at the end of interval k - 1, so h is taken with the input applied there
-    (zero before the first). ``measurement_sd`` should hold the model's error as well as the sensor's: in fast charging
-    the model error dominates. An entry may be the name of a model parameter, which theta can set. A sample that is not
-    finite is left out. Outputs are processed one by one, which is exact for a diagonal R.
-    Source: Plett, Battery Management Systems, vol. 2, ch. 3; Simon, Optimal State Estimation, sec. 6.1 and 13.2.
-    """
-
-    measured: tuple[str, ...]
-    measurement_sd: tuple[float | str, ...]
-    process_sd: tuple[float, ...]
-    start_sd: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.measured) != len(self.measurement_sd) or not self.measured:
-            raise ValueError(
-                f"estimator: measurement_sd has {len(self.measurement_sd)} values, expected one for each of {list(self.measured)}"
-            )
-        for name, least in (("measurement_sd", 0.0), ("process_sd", 0.0), ("start_sd", 0.0)):
-            values = [v for v in getattr(self, name) if not isinstance(v, str)]
-            strict = name == "measurement_sd"
-            if not all(math.isfinite(v) and (v > least if strict else v >= least) for v in values):
-                raise ValueError(f"estimator: {name} = {list(values)}, allowed are finite numbers {'>' if strict else '>='} 0")
-
-    def signals(self, model: Model) -> tuple[str, ...]:
-        unknown = sorted(set(self.measured) - set(model.output_names))
-        if unknown:
-            raise ValueError(f"estimator: measured = {unknown}, allowed are {', '.join(model.output_names)}")
-        named = [sd for sd in self.measurement_sd if isinstance(sd, str)]
-        if any(model.parameter_blocks.get(sd) != 1 for sd in named):
-            raise ValueError(f"estimator: measurement_sd names {named}, allowed are scalar parameters of model {model.name}")
-        for name in ("process_sd", "start_sd"):
-            if len(getattr(self, name)) != len(model.states):
-                raise ValueError(
-                    f"estimator: {name} has {len(getattr(self, name))} values, expected one for each of {list(model.state_names)}"
-                )
-        return self.measured
-
-    def initial(self, model: Model, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        covariance = np.diag(np.square(self.start_sd))
-        return np.concatenate([np.asarray(state, dtype=float), covariance.ravel(order="F")])
-
-    def correct(self, model: Model, memory: Any, y: Mapping[str, Any], u: Any, p: Any) -> tuple[Any, Any]:
-        nx = len(model.states)
-        x, packed = split(memory, (nx, nx * nx))
-        covariance = ca.reshape(packed, nx, nx)
-        at = ca.SX.sym("at", nx)
-        outputs = model.h(at, u, p)
-        for name, sd in zip(self.measured, self.measurement_sd, strict=True):
-            output = outputs[model.output_names.index(name)]
-            row, value = ca.substitute([ca.jacobian(output, at), output], [at], [x])
-            spread = ca.mtimes(covariance, row.T)
-            usable = finite(y[name])
-            noise = Named(model.parameter_blocks, p)[sd] if isinstance(sd, str) else sd
-            gain = ca.if_else(usable, 1, 0) * spread / (ca.mtimes(row, spread) + noise**2)
-            x = x + gain * ca.if_else(usable, y[name] - value, 0)
-            covariance = covariance - ca.mtimes(gain, spread.T)
-        covariance = (covariance + covariance.T) / 2
-        return x, ca.vertcat(x, ca.vec(covariance))
-
-    def predict(self, model: Model, x_hat: Any, memory: Any, u: Any, p: Any) -> Any:
-        nx = len(model.states)
-        _, packed = split(memory, (nx, nx * nx))
-        covariance = ca.reshape(packed, nx, nx)
-        at = ca.SX.sym("at", nx)
-        (transition,) = ca.substitute([ca.jacobian(model.f(at, u, p), at)], [at], [x_hat])
-        ahead = ca.mtimes([transition, covariance, transition.T]) + ca.DM(np.diag(np.square(self.process_sd)))
-        return ca.vertcat(model.f(x_hat, u, p), ca.vec(ahead))

@@ -63,7 +63,7 @@ def test_nothing_is_found_in_the_case_studies(seed):
 
 
 PLANTED = {
-    "R1 with a measured U1": ({"overpotential": "exact"}, "no-influence", "warning", "overpotential is measured"),
+    "R1 with a measured U1": ({"kind": "exact"}, "no-influence", "warning", "overpotential is measured"),
     "current too small for the limit": ({"current_max_A": 0.5}, "no-influence", "error", "nothing to tune"),
     "a node that the charge does not visit": (
         {"R1": None, "current_limit": CurrentLimit()}, "no-influence", "warning", "current_limit[0]",
@@ -107,12 +107,12 @@ def test_a_cell_warmer_than_its_limit_is_an_unsafe_start():
 
 
 def test_the_numbers_behind_r1_with_a_measured_overpotential():
-    (found,) = check_charging(problem(overpotential="exact"), quick=True)
+    (found,) = check_charging(problem(kind="exact"), quick=True)
     # A uniform factor from 0.1 to 6 on R1: with U1 propagated the worst voltage goes from 289 mV over the limit to 122 mV below.
     assert found.numbers["range_propagated_mV"] == pytest.approx(289 + 122, abs=5)
     assert found.numbers["range_measured_mV"] < 60
     factors, excess = found.evidence.lines["measured"]
-    episode = run_charge(problem(overpotential="exact"), np.full(9, factors[-1]))
+    episode = run_charge(problem(kind="exact"), np.full(9, factors[-1]))
     assert excess[-1] == pytest.approx(1e3 * (max(map(np.max, episode.signal("voltage_V"))) - 4.2), abs=0.01)
 
 

@@ -129,7 +129,7 @@ REFUSED = [
     ("[controller]\nsampling_time_s = true", "controller.sampling_time_s = True: input should be a valid number"),
     ("[controller]\nsampling_time_s = 1979-05-27", "controller.sampling_time_s = {'date': '1979-05-27'}: input should be a valid number"),
     ("[controller]\nsampling_time_s = nan", "controller: sampling_time_s = nan, allowed is [0.001, 3600] s"),
-    ("[controller]\noverpotential = 'none'", "controller.overpotential = 'none': input should be 'model' or 'exact'"),
+    ("[controller]\noverpotential = 'none'", "controller.overpotential = 'none', allowed is 'model' or 'exact'"),
     ("[estimator.kalman]\nvoltage_sd_V = 0.0", "estimator.kalman: kalman: voltage_sd_V = 0.0, allowed is (0, 100]"),
     ("[limits]\nhard = 'voltage_max_V'", "limits.hard = 'voltage_max_V': input should be a valid array"),
     (

@@ -31,7 +31,9 @@ def start_state(cell: Cell, soc: float) -> dict[str, float]:
     return {"soc": soc} | ({"temperature_K": cell.thermal.ambient_K} if cell.thermal else {})
 
 
-def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, float] | None = None) -> Model:
+def ecm_model(
+    cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, float] | None = None, *, last_current: bool = False
+) -> Model:
     """n-RC circuit of a cell, current I charge-positive (A), states z = SOC and U1 .. Un (V), output V.
 
         z+  = z + eta Ts / (3600 Q) I
@@ -50,7 +52,8 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, 
         T+  = T_e + (T - T_e) exp(-Ts hA / C),   T_e = T_ambient + Q / hA
 
     and all resistances are multiplied by s(T). A cell with an ``anode`` table has the output anode_potential_V.
-    ``settings`` are further run-time parameters that f and h do not read, for an estimator that does.
+    ``settings`` are further run-time parameters for an estimator; of them f and h read resistance_factor alone, where it is
+    given: a factor on all resistances. With ``last_current`` the current of the interval before is a state, last_current_A.
     """
     nodes = table_nodes(cell.soc)
     low, high = int(cell.soc[0] > 0.0), int(cell.soc[-1] < 1.0)
@@ -66,6 +69,7 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, 
     def equations(x: Named, u: Named, p: Named) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         z, current = x["soc"], u["current_A"]
         factor = thermal.resistance_factor(x["temperature_K"], p["activation_J_mol"], p["reference_K"]) if thermal else 1
+        factor *= p.get("resistance_factor", 1)
         following = {"soc": z + p["coulombic_efficiency"] * sampling_time_s / 3600 / p["capacity_Ah"] * current}
         polarised = table(z, p["R0_ohm"]) * factor * current
         for k, name in pairs.items():
@@ -81,6 +85,8 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, 
             decay = ca.exp(-sampling_time_s * p["cooling_W_K"] / p["heat_capacity_J_K"])
             following["temperature_K"] = settled + (temperature - settled) * decay
             outputs["temperature_K"] = temperature
+        if last_current:
+            following["last_current_A"] = current
         if anode:
             outputs["anode_potential_V"] = (
                 pchip(z, anode.soc, anode.potential_V) - pchip(z, anode.soc, anode.resistance_ohm) * factor * current
@@ -93,11 +99,14 @@ def ecm_model(cell: Cell, sampling_time_s: float = 10.0, settings: Mapping[str, 
     if thermal:
         states.append(Signal("temperature_K", "K"))
         parameters |= {name: getattr(thermal, name) for name in of_thermal}
+    outputs = list(states)
+    if last_current:
+        states.append(Signal("last_current_A", "A"))
     return Model.build(
         f"{'R-' + 'RC' * len(pairs)} circuit{' with temperature' if thermal else ''}",
         states=states,
         inputs=(Signal("current_A", "A"),),
-        outputs=(Signal("voltage_V", "V"), *states, *([Signal("anode_potential_V", "V")] if anode else [])),
+        outputs=(Signal("voltage_V", "V"), *outputs, *([Signal("anode_potential_V", "V")] if anode else [])),
         parameters=parameters | dict(settings or {}),
         sampling_time_s=sampling_time_s,
         equations=equations,

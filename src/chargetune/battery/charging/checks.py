@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.battery.cell.equivalent_circuit import ecm_model
-from chargetune.battery.charging.controller import controller_of, filter_settings
+from chargetune.battery.charging.controller import controller_model, controller_of
 from chargetune.battery.charging.evaluate import evaluate, plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem, stand_in
+from chargetune.battery.charging.ringing import check_ringing
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_theta
@@ -43,7 +43,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
     circuit = stand_in(problem)
     controller, plant = controller_of(circuit), plant_of(circuit)
     signs = {(name, "current_A"): sign for name, sign in SIGNS.items() if name in controller.model.output_names}
-    finer = ecm_model(circuit.cell, circuit.controller.sampling_time_s / FINER, filter_settings(circuit))
+    finer = controller_model(circuit, circuit.controller.sampling_time_s / FINER)
     found = list(
         check_formulation(
             controller,
@@ -62,6 +62,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
         found += weak or check_theta(lambda theta: _beyond(circuit, theta), circuit.space)
         if start is not None:
             found += check_theta(lambda theta: _beyond(circuit, theta), circuit.space, start)
+    found += check_ringing(circuit)
     found += _plant_signs(problem, 1 if quick else PROBE_STEPS)
     return tuple(sorted(found, key=lambda finding: finding.severity != "error"))
 
@@ -105,14 +106,14 @@ def _target(problem: ChargingProblem) -> list[Finding]:
 def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
     """A resistance of an R-C pair in theta although the overpotential that it predicts is measured."""
     tuned = {of: ratio for of, ratio in problem.theta.ratios.items() if of != "R0"}
-    if problem.controller.overpotential != "exact" or problem.estimator.kalman is not None or not tuned:
+    if problem.estimator.kind != "exact" or not tuned:
         return []
     out = []
     for of, ratio in tuned.items():
         ranges, curves = {}, {}
         part = problem.space.slices[ratio.name(of)]
-        for way in ("exact", "model"):
-            variant = replace(problem, controller=replace(problem.controller, overpotential=way))
+        for way in ("exact", "open_loop"):
+            variant = replace(problem, estimator=replace(problem.estimator, kind=way))
             values = np.linspace(0.0, 1.0, 9)
             units = [variant.space.to_unit(variant.space.default) for _ in values]
             for unit, value in zip(units, values, strict=True):
@@ -121,7 +122,7 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
             factors = np.geomspace(ratio.lower, ratio.upper, values.size)
             curves["measured" if way == "exact" else "propagated by the model"] = (factors, 1e3 * excess)
             ranges[way] = 1e3 * float(np.ptp(excess))
-        if ranges["exact"] < SAY * ranges["model"]:
+        if ranges["exact"] < SAY * ranges["open_loop"]:
             out.append(
                 Finding(
                     "no-influence",
@@ -129,8 +130,8 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
                     f"{ratio.name(of)} has next to no influence: the overpotential is measured at every step, which replaces what {of} "
                     f"predicts; over its whole range the worst voltage moves by {ranges['exact']:.0f} mV (by "
                     f"{ranges['model']:.0f} mV if the model propagated it)",
-                    'overpotential = "model" (an overpotential cannot be measured on a real cell), or tune R0 or a backoff instead',
-                    {"range_measured_mV": ranges["exact"], "range_propagated_mV": ranges["model"]},
+                    'estimator.kind = "open_loop" (an overpotential cannot be measured on a real cell), or tune R0 or a backoff instead',
+                    {"range_measured_mV": ranges["exact"], "range_propagated_mV": ranges["open_loop"]},
                     Evidence(f"factor on {of}", "worst voltage over the limit (mV)", curves, {"limit": 0.0}),
                 )
             )

@@ -6,18 +6,22 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model, overpotentials, start_state
+from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import HARD_FACTOR, Limit
+from chargetune.battery.charging.observers import Adaptive, OffsetFree, observer_filter, observer_model, voltage_backoff
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.control.controller import Controller, SoftLimit, Stage
 from chargetune.control.estimators import Estimator, ExactState, Propagated
 from chargetune.episode.episode import Episode
+from chargetune.model.model import Model
 from chargetune.runtime.cache import Built
 
-__all__ = ["controller_of", "estimator_of", "filter_settings", "measured_rows", "row_tolerances", "soft_limits"]
+__all__ = ["controller_model", "controller_of", "estimator_of", "measured_rows", "row_tolerances", "soft_limits"]
 
 # A violation of a limit that is noticed, in its unit: the solver's tolerance is relative to it.
 NOTICED = {"voltage": 0.1, "temperature": 1.0, "anode": 0.01}
@@ -39,16 +43,17 @@ def _build(problem: ChargingProblem) -> Controller:
 
     def believed(stage: Stage) -> dict[str, Any]:
         changed = {f"{of}_ohm": stage.p[f"{of}_ohm"] * stage.theta[ratio.name(of)] for of, ratio in theta.ratios.items()}
-        return changed | ({"voltage_sd_V": stage.theta["voltage_sd_V"]} if theta.voltage_sd else {})
+        return changed | {name: stage.theta[name] for name in theta.observed if name in stage.p}
 
     def most(stage: Stage) -> Any:
-        return largest * theta.current_limit.share(stage) if theta.current_limit else largest
+        bound = largest * theta.current_limit.share(stage) if theta.current_limit else largest
+        if settings.current_ramp_A_s is None:
+            return bound
+        return ca.fmin(bound, ca.fmax(stage.now["last_current_A"], 0.0) + settings.current_ramp_A_s * settings.sampling_time_s)
 
     # Both models come from the same cell, so that the compiled problem is the same for every mismatch.
     belief = problem.controller_cell
-    model = ecm_model(problem.cell, settings.sampling_time_s, filter_settings(problem)).with_parameters(
-        **{name: getattr(belief, name) for name in belief.tables}
-    )
+    model = controller_model(problem, settings.sampling_time_s).with_parameters(**{name: getattr(belief, name) for name in belief.tables})
     return Controller.build(
         model,
         problem.space,
@@ -58,26 +63,38 @@ def _build(problem: ChargingProblem) -> Controller:
         parameters=believed,
         input_lower={"current_A": least},
         input_upper={"current_A": most},
-        limits=soft_limits(problem),
+        limits=soft_limits(problem, model),
         fallback={"current_A": max(least, 0.0)},
         setpoint={"soc": problem.episode.soc_target},
         start=start_state(problem.cell, problem.episode.soc_start + problem.estimator.soc_start_error),
-        estimator=estimator_of(problem),
+        estimator=estimator_of(problem, model),
     )
 
 
-def filter_settings(problem: ChargingProblem) -> dict[str, float]:
-    """What the controller's model holds beside the circuit, since theta changes it: the spread that its filter assumes."""
-    kalman = problem.estimator.kalman
-    return {"voltage_sd_V": kalman.voltage_sd_V} if kalman and problem.theta.voltage_sd else {}
+def controller_model(problem: ChargingProblem, sampling_time_s: float) -> Model:
+    """The circuit as the controller has it, with what its filter needs; the numbers are the cell's."""
+    observer, ramp = problem.estimator.settings, problem.controller.current_ramp_A_s is not None
+    circuit = ecm_model(problem.cell, sampling_time_s, _filter_settings(problem), last_current=ramp)
+    return observer_model(circuit, observer) if isinstance(observer, (OffsetFree, Adaptive)) else circuit
 
 
-def soft_limits(problem: ChargingProblem) -> list[SoftLimit]:
-    """The limits that the controller sees, upper and lower bound of the same output together."""
-    theta = problem.theta
+def _filter_settings(problem: ChargingProblem) -> dict[str, float]:
+    """Parameters of the controller's circuit beside the cell's: the spread that its filter assumes, where theta changes it."""
+    observer = problem.estimator.settings
+    if isinstance(observer, Adaptive):
+        return {"resistance_factor": 1.0}
+    return {"voltage_sd_V": observer.voltage_sd_V} if isinstance(observer, Kalman) and problem.theta.voltage_sd else {}
+
+
+def soft_limits(problem: ChargingProblem, model: Model) -> list[SoftLimit]:
+    """The limits that the controller sees, upper and lower bound of the same output together; ``model`` is its own."""
+    theta, observer = problem.theta, problem.estimator.settings
     margins: dict[str, Callable[[Stage], Any]] = {of: partial(part.margin, of) for of, part in theta.limit_backoffs.items()}
     if theta.backoff:
         margins["voltage"] = theta.backoff.voltage
+    if isinstance(observer, (OffsetFree, Adaptive)):
+        tuned, default = margins.get("voltage"), voltage_backoff(problem.cell, model, problem.current_max_A, observer)
+        margins["voltage"] = lambda stage: default(stage.u, stage.p) + (tuned(stage) if tuned else 0.0)
     bounds: dict[str, dict[str, Any]] = {}
     for limit in problem.limits_by_name.values():
         what = limit.of
@@ -99,13 +116,15 @@ def soft_limits(problem: ChargingProblem) -> list[SoftLimit]:
     return [SoftLimit(signal, **own) for signal, own in bounds.items()]
 
 
-def estimator_of(problem: ChargingProblem) -> Estimator:
-    """The state estimator of the controller."""
-    cell, kalman = problem.cell, problem.estimator.kalman
+def estimator_of(problem: ChargingProblem, model: Model) -> Estimator:
+    """The state estimator of the controller, whose model this is."""
+    cell, observer = problem.cell, problem.estimator.settings
     thermal = ("temperature_K",) if cell.thermal else ()
-    if kalman:
-        return kalman.estimator(overpotentials(cell), thermal=bool(thermal), tuned=problem.theta.voltage_sd is not None)
-    return Propagated(("soc", *thermal)) if problem.controller.overpotential == "model" else ExactState()
+    if isinstance(observer, Kalman):
+        return observer.estimator(overpotentials(cell), thermal=bool(thermal), tuned=problem.theta.voltage_sd is not None)
+    if observer is not None:
+        return observer_filter(cell, model, observer)
+    return Propagated(("soc", *thermal)) if problem.estimator.kind == "open_loop" else ExactState()
 
 
 def measured_rows(problem: ChargingProblem, episode: Episode) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from chargetune.battery.validation import check_number
-from chargetune.control.estimators import ExtendedKalman
+from chargetune.control.kalman import ExtendedKalman
 
 __all__ = ["Kalman"]
 

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.cell.cell import Cell, mismatched
+from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import Limit, LimitSettings
+from chargetune.battery.charging.observers import settings_of
 from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import (
     ControllerSettings,
@@ -102,10 +104,19 @@ class ChargingProblem:
                 f"theta has {', '.join(of)}, allowed is one of each limit that the controller's model predicts: {sorted(kept)}"
             )
         if theta.voltage_sd is not None:
-            if self.estimator.kalman is None:
+            if not isinstance(self.estimator.settings, Kalman):
                 raise ValueError("theta.voltage_sd is given without estimator.kalman: only a Kalman filter has a spread to tune")
-            own = self.estimator.kalman.voltage_sd_V
+            own = self.estimator.settings.voltage_sd_V
             check_number("kalman: voltage_sd_V", own, theta.voltage_sd.lower_V, theta.voltage_sd.upper_V, "V, which theta.voltage_sd spans")
+
+        numbers = self._observer_numbers
+        for part in theta.observer:
+            if part.name not in numbers or isinstance(self.estimator.settings, Kalman):
+                raise ValueError(
+                    f"theta.observer names {part.name!r}, allowed are numbers of the estimator of kind {self.estimator.kind!r}: "
+                    f"{', '.join(numbers) or '(none)'}"
+                )
+            check_number(f"estimator: {part.name}", numbers[part.name], part.lower, part.upper, ", which theta.observer spans")
 
     def _check_physics(self) -> None:
         cell, start, highest, backoff = self.cell, self.episode.soc_start, self.voltage_max_V, self.theta.backoff
@@ -162,8 +173,15 @@ class ChargingProblem:
     @property
     def space(self) -> ParameterSpace:
         """The space of theta."""
-        kalman = self.estimator.kalman
-        return _space(self.theta, len(self.cell.soc), 0.0 if kalman is None else kalman.voltage_sd_V)
+        return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()))
+
+    @property
+    def _observer_numbers(self) -> dict[str, float]:
+        """The filter's numbers that theta may set, by name."""
+        observer = self.estimator.settings
+        if isinstance(observer, Kalman):
+            return {"voltage_sd_V": observer.voltage_sd_V}
+        return {} if observer is None else settings_of(observer)
 
     @property
     def theta_values(self) -> NDArray[np.float64]:
@@ -178,8 +196,8 @@ class ChargingProblem:
 
 
 @built_once(64)
-def _space(theta: Tunables, nodes: int, voltage_sd_V: float) -> ParameterSpace:
-    return theta.space(nodes, voltage_sd_V)
+def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...]) -> ParameterSpace:
+    return theta.space(nodes, dict(observer))
 
 
 def judged_exactly(problem: ChargingProblem) -> ChargingProblem:

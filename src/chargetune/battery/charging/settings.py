@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from chargetune.battery.charging.kalman import Kalman
+from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.validation import check_count, check_number
 from chargetune.plants.sensors import Sensors
 
-__all__ = ["ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
+__all__ = ["FILTERS", "ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
 
 
 # A sensor that errs by more measures nothing that a charge could be controlled by.
@@ -26,15 +27,15 @@ SENSOR_ERRORS = {
 class ControllerSettings:
     """The controller and what it wrongly believes; no ``mismatch_seed`` means that it knows the cell.
 
-    ``overpotential``: "model" propagates the overpotentials by the controller's own model from a measured SOC, "exact" gives it the
-    plant's. ``penalty_per_V`` is the exact penalty of the voltage limits; the other limits' follow from it.
+    ``penalty_per_V`` is the exact penalty of the voltage limits; the other limits' follow from it. ``current_ramp_A_s`` is by how much
+    the current may rise per second, so that the first intervals show the resistance before the current is large; None: at once.
     """
 
     sampling_time_s: float = 10.0
     horizon: int = 5
     mismatch_seed: int | None = None
-    overpotential: Literal["model", "exact"] = "model"
     penalty_per_V: float = 1e3
+    current_ramp_A_s: float | None = None
 
     def __post_init__(self) -> None:
         check_number("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
@@ -43,23 +44,58 @@ class ControllerSettings:
         seed = self.mismatch_seed
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
             raise ValueError(f"mismatch_seed = {seed!r}, allowed is an integer >= 0")
-        if self.overpotential not in ("model", "exact"):
-            raise ValueError(f"overpotential = {self.overpotential!r}, allowed is 'model' or 'exact'")
+        if self.current_ramp_A_s is not None:
+            check_number("current_ramp_A_s", self.current_ramp_A_s, 0.0, 1e4, "A/s", open_low=True)
+
+
+Kind = Literal["open_loop", "exact", "kalman", "offset_free", "adaptive"]
+FILTERS = ("kalman", "offset_free", "adaptive")
 
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """What the controller knows of the state.
+    """What the controller knows of the state, and how.
 
-    ``soc_start_error`` is what it believes of the SOC at the start less the truth. A ``kalman`` filter estimates SOC and
-    overpotentials from voltage and current instead of a measured SOC.
+    kind
+        "open_loop": the SOC and, in a thermal model, the temperature are the plant's; the overpotentials follow the controller's own
+        model, and the voltage is not read. That is the paper's controller. "exact": every state of the circuit is the plant's, which no
+        real cell tells. "kalman": a filter on voltage and temperature estimates SOC and overpotentials (`Kalman`). "offset_free": the
+        voltage's error is a disturbance that a filter follows, the SOC is counted (`OffsetFree`). "adaptive": the same with a
+        common factor of the resistances (`Adaptive`). None: that whose settings are given, else open_loop.
+    soc_start_error
+        What is believed of the SOC at the start less the truth; no more than a guess where the voltage at rest sets it.
+    kalman, offset_free, adaptive
+        The settings of the kind of that name; None: its defaults.
     """
 
+    kind: Kind | None = None
     soc_start_error: float = 0.0
     kalman: Kalman | None = None
+    offset_free: OffsetFree | None = None
+    adaptive: Adaptive | None = None
 
     def __post_init__(self) -> None:
         check_number("soc_start_error", self.soc_start_error, -0.5, 0.5)
+        named = [name for name in FILTERS if getattr(self, name) is not None]
+        if self.kind is None:
+            object.__setattr__(self, "kind", named[0] if named else "open_loop")
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"estimator: kind = {self.kind!r}, allowed are {', '.join(get_args(Kind))}")
+        given = [name for name in named if name != self.kind]
+        if given:
+            raise ValueError(f"estimator: settings of {', '.join(given)} are given with kind = {self.kind!r}, allowed are its own")
+
+    @property
+    def settings(self) -> Kalman | OffsetFree | Adaptive | None:
+        """The settings of the filter; None where there is none."""
+        match self.kind:
+            case "kalman":
+                return self.kalman or Kalman()
+            case "offset_free":
+                return self.offset_free or OffsetFree()
+            case "adaptive":
+                return self.adaptive or Adaptive()
+        return None
 
 
 @dataclass(frozen=True)

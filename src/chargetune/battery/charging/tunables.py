@@ -15,7 +15,7 @@ from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.model.splines import natural_spline, piecewise_linear
 
-__all__ = ["Backoff", "CurrentLimit", "LimitBackoff", "MeasurementSpread", "ResistanceRatio", "Tunables"]
+__all__ = ["Backoff", "CurrentLimit", "LimitBackoff", "MeasurementSpread", "ObserverSetting", "ResistanceRatio", "Tunables"]
 
 Resistance = Literal["R0", "R1", "R2", "R3"]
 RESISTANCES: tuple[Resistance, ...] = ("R0", "R1", "R2", "R3")
@@ -156,6 +156,25 @@ class MeasurementSpread:
 
 
 @dataclass(frozen=True)
+class ObserverSetting:
+    """theta in the observer: one of its standard deviations, by its name in `OffsetFree` or `Adaptive`, log scale.
+
+    Untuned it is the observer's own.
+    """
+
+    name: str
+    lower: float
+    upper: float
+
+    def __post_init__(self) -> None:
+        check_number(f"observer: lower of {self.name}", self.lower, 1e-9, 1e3)
+        check_number(f"observer: upper of {self.name}", self.upper, self.lower, 1e3, open_low=True)
+
+    def parameter(self, default: float) -> Parameter:
+        return Parameter(self.name, self.lower, self.upper, default, scale="log")
+
+
+@dataclass(frozen=True)
 class Tunables:
     """What theta consists of, each part by its place in the controller, and values for it to simulate with.
 
@@ -172,9 +191,14 @@ class Tunables:
     temperature_backoff: LimitBackoff | None = None
     anode_backoff: LimitBackoff | None = None
     voltage_sd: MeasurementSpread | None = None
+    observer: tuple[ObserverSetting, ...] = ()
     values: Mapping[str, float | list[float]] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "observer", tuple(self.observer))
+        names = [part.name for part in self.observer]
+        if len(set(names)) < len(names):
+            raise ValueError(f"theta.observer names {names}, allowed are different names")
         for of, part in self.limit_backoffs.items():
             widest, unit = WIDEST[of]
             check_number(f"{of}_backoff: lower", part.lower, -widest, 0.0, unit)
@@ -191,14 +215,20 @@ class Tunables:
         parts = {"temperature": self.temperature_backoff, "anode": self.anode_backoff}
         return {of: part for of, part in parts.items() if part is not None}
 
-    def space(self, nodes: int, voltage_sd_V: float) -> ParameterSpace:
-        """The space of theta for a cell with so many SOC nodes and a filter that assumes this spread of the voltage."""
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Names of the filter's numbers that are tuned."""
+        return (*(["voltage_sd_V"] if self.voltage_sd else []), *(part.name for part in self.observer))
+
+    def space(self, nodes: int, observer: Mapping[str, float]) -> ParameterSpace:
+        """The space of theta for a cell with so many SOC nodes and a filter with these numbers by name."""
         return ParameterSpace(
             (
                 *([self.backoff.parameter] if self.backoff else []),
                 *(part.parameter(of, nodes) for of, part in self.ratios.items()),
                 *(part.parameter(of) for of, part in self.limit_backoffs.items()),
                 *([self.current_limit.parameter] if self.current_limit else []),
-                *([self.voltage_sd.parameter(voltage_sd_V)] if self.voltage_sd else []),
+                *([self.voltage_sd.parameter(observer["voltage_sd_V"])] if self.voltage_sd else []),
+                *(part.parameter(observer[part.name]) for part in self.observer),
             )
         )

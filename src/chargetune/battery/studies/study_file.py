@@ -14,10 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from chargetune.battery.cell.cell import Cell, default_cell, load_cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
+from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import LimitSettings
+from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import (
+    FILTERS,
     ControllerSettings,
     EpisodeSettings,
     EstimatorSettings,
@@ -132,12 +135,52 @@ class Config(_Table):
         for name in ("safety", "twin", "range"):
             if data[name] is None:
                 del data[name]
-        return data
+        settings = self.estimator.settings
+        if isinstance(settings, (OffsetFree, Adaptive)):
+            # Defaults may change; what decides the trials does not.
+            data["estimator"][str(self.estimator.kind)] = asdict(settings)
+        for table, name in (("controller", "current_ramp_A_s"), ("theta", "observer"), *(("estimator", name) for name in FILTERS)):
+            if not data[table][name]:
+                del data[table][name]
+        return data | _as_recorded(data)
 
     def _cell(self, folder: Path | None) -> Cell:
         if self.cell.file is None:
             return default_cell()
         return load_cell(Path(self.cell.file) if folder is None else folder / self.cell.file)
+
+
+# What older files and stores call the kind of the estimator.
+OVERPOTENTIAL = {"model": "open_loop", "exact": "exact"}
+
+
+def _as_recorded(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of controller and estimator as studies of before ``estimator.kind`` have them, that those resume."""
+    controller, estimator = data["controller"], {**data["estimator"]}
+    kind = estimator["kind"]
+    if kind in ("offset_free", "adaptive"):
+        return {}
+    del estimator["kind"]
+    filters = {"kalman": estimator.get("kalman") or (asdict(Kalman()) if kind == "kalman" else None)}
+    old = {"overpotential": next((old for old, new in OVERPOTENTIAL.items() if new == kind), "model")}
+    return {"controller": {**controller, **old}, "estimator": {**estimator, **filters}}
+
+
+def _migrated(data: dict[str, Any]) -> dict[str, Any]:
+    """Tables of an older file or store with ``estimator.kind`` instead of ``controller.overpotential`` and a table [estimator.kalman]."""
+    controller, estimator = data.get("controller"), data.get("estimator", {})
+    if not isinstance(estimator, dict):
+        return data
+    if not isinstance(controller, dict) or "overpotential" not in controller:
+        return data
+    old = controller["overpotential"]
+    if "kind" in estimator:
+        raise ValueError(f"controller.overpotential = {old!r} and estimator.kind = {estimator['kind']!r} are given, allowed is one of them")
+    if not isinstance(old, str) or old not in OVERPOTENTIAL:
+        raise ValueError(f"controller.overpotential = {old!r}, allowed is 'model' or 'exact'; it is estimator.kind today")
+    kind = "kalman" if estimator.get("kalman") is not None else OVERPOTENTIAL[old]
+    rest = {name: value for name, value in controller.items() if name != "overpotential"}
+    return data | {"controller": rest, "estimator": {"kind": kind, **estimator}}
 
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
@@ -146,7 +189,7 @@ def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     for name, make in (("thermal", Thermal), ("anode", Anode)):
         cell[name] = make(**_tuples(cell[name])) if cell.get(name) else None
     tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
-    return Config.model_validate_json(json.dumps(tables)).problem(cell=Cell(**cell))
+    return Config.model_validate_json(json.dumps(_migrated(tables))).problem(cell=Cell(**cell))
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -164,6 +207,11 @@ def read_tables(path: str | Path, model: type[T]) -> T:
         data = tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"{path} is not valid TOML: {error}") from error
+    if model is Config:
+        try:
+            data = _migrated(data)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
     try:
         # A dataclass is made from a table of JSON, but in strict mode not from a dict. JSON has no dates, and no key here is one.
         return model.model_validate_json(json.dumps(data, default=lambda date: {"date": str(date)}))
