@@ -16,7 +16,7 @@ import time
 
 import numpy as np
 
-# (nx, nu, N, limits)
+# States, inputs, horizon, soft limits.
 SIZES = ((4, 1, 20, 2), (8, 2, 20, 4), (10, 2, 20, 4), (12, 4, 30, 6), (30, 4, 30, 6), (12, 4, 100, 6))
 STEPS = 100
 
@@ -34,7 +34,7 @@ def loop(nx, nu, horizon, limits, blocks=None):
     b = draw.normal(size=(nx, nu))
     states, inputs = [f"x{i}" for i in range(nx)], [f"u{i}" for i in range(nu)]
 
-    def equations(x, u, p):
+    def equations(x, u, _):
         after = {name: sum(a[i, j] * x[s] for j, s in enumerate(states)) for i, name in enumerate(states)}
         for i, name in enumerate(states):
             after[name] += sum(b[i, j] * u[s] for j, s in enumerate(inputs))

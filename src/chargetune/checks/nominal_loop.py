@@ -94,10 +94,11 @@ def check_limits(controller: Controller, run: Episode, *, finer: Model | None = 
 
 def check_longer_horizon(controller: Controller, run: Episode, theta: ArrayLike | None = None) -> list[Finding]:
     """A horizon so short that the perfect model does clearly better, or keeps a limit, with a longer one."""
-    longer = min(HORIZON_MAX, max(4 * controller.horizon, 20))
+    longer = max(controller.horizon, min(HORIZON_MAX, max(4 * controller.horizon, 20)))
     if longer == controller.horizon:
         return []
-    far = simulate(replace(controller, horizon=longer), perfect_plant(controller, theta), steps=len(run), theta=theta, compiled=False)
+    longer_controller = replace(controller, horizon=longer, blocks=())
+    far = simulate(longer_controller, perfect_plant(controller, theta), steps=len(run), theta=theta, compiled=False)
     near_cost, far_cost = _costs(controller, run, theta), _costs(controller, far, theta)
     near, better = float(np.sum(near_cost)), float(np.sum(far_cost))
     if len(far) < len(run) or not better < near - WORTH * abs(near):

@@ -53,7 +53,7 @@ def control_step(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     last, warm, q = ca.MX.sym("u", nu), ca.MX.sym("warm", solve.size1_in(1)), ca.MX.sym("q", solve.size1_in(2))
     estimate, corrected = problem.correct(memory, y, last, q)
     inputs, following, status, kkt, count = solve(estimate, warm, q)
-    u, *_ = split(inputs, [nu] * problem.controller.horizon)
+    u, _ = split(inputs, (nu, problem.size - nu))
     ahead = problem.predict(estimate, corrected, u, q)
     return ca.Function("control_step", [memory, y, last, warm, q], [u, ahead, following, status, kkt, count, estimate])
 

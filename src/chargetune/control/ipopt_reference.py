@@ -2,7 +2,7 @@
 
 Direct multiple shooting with the states as variables and the model as equality constraints, slacks as variables, exact
 Hessians. It shares the controller's own functions with `ocp` and nothing else: no condensing, no scaling, no
-linearisation. Some hundred times slower; for tests, and on request: ``run_episode(..., act=ipopt_act)``.
+linearisation. Some hundred times slower; for tests, and on request: ``run_episode(..., control=ipopt_act)``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Nlp:
-    """The problem for IPOPT: variables (u_0 .. u_{N-1}, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal)."""
+    """The problem for IPOPT: variables (an input a block, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal)."""
 
     solver: ca.Function
     equalities: int
@@ -48,7 +48,9 @@ def multiple_shooting(controller: Controller) -> Nlp:
     now, theta = ca.MX.sym("now", nx), ca.MX.sym("theta", controller.theta.dimension)
     setpoint, nominal = ca.MX.sym("setpoint", nx + nu), ca.MX.sym("p", model.nominal.size)
     p = controller.parameters(theta, nominal)
-    inputs, states = ca.MX.sym("U", nu, horizon), ca.MX.sym("X", nx, horizon)
+    blocks = controller.input_blocks
+    inputs, states = ca.MX.sym("U", nu, len(blocks)), ca.MX.sym("X", nx, horizon)
+    block_of = [k for k, length in enumerate(blocks) for _ in range(length)]
     slack = ca.MX.sym("s", len(controller.limits))
     cost: Any = ca.MX(0.0)
     gaps: list[Any] = []
@@ -60,7 +62,7 @@ def multiple_shooting(controller: Controller) -> Nlp:
 
     x: Any = now
     for i in range(horizon):
-        u = inputs[:, i]
+        u = inputs[:, block_of[i]]
         cost += controller.stage_cost(x, u, theta, p, setpoint, now)
         add_rows(("start", "both"), i, x, u)
         gaps.append(states[:, i] - model.f(x, u, p))
@@ -92,7 +94,9 @@ def ipopt_act(
     problem = problem_of(controller)
     nlp = cached(f"ipopt {controller.structure}", lambda: multiple_shooting(controller))
     model, horizon, nominal = controller.model, controller.horizon, controller.model.nominal
-    nx, nu, size = len(model.states), len(model.inputs), horizon * len(model.inputs)
+    blocks = controller.input_blocks
+    count = len(blocks)
+    nx, nu, size = len(model.states), len(model.inputs), count * len(model.inputs)
     q = problem.prepare(theta, ca.DM(controller.setpoint), nominal)
     estimate, corrected = problem.correct(memory.estimator, received, memory.last_input, q)
     now = np.array(estimate).ravel()
@@ -101,13 +105,13 @@ def ipopt_act(
     warm = memory.warm[:size]
     slacks = len(controller.limits)
     guess = np.concatenate(
-        [np.clip(warm, np.tile(lower, horizon), np.tile(upper, horizon)), _roll_out(controller, now, warm, theta), np.zeros(slacks)]
+        [np.clip(warm, np.tile(lower, count), np.tile(upper, count)), _roll_out(controller, now, warm, theta), np.zeros(slacks)]
     )
     solution = nlp.solver(
         x0=guess,
         p=np.concatenate([now, theta, controller.setpoint, nominal]),
-        lbx=np.concatenate([np.tile(lower, horizon), np.full(horizon * nx, -np.inf), np.zeros(slacks)]),
-        ubx=np.concatenate([np.tile(upper, horizon), np.full(horizon * nx + slacks, np.inf)]),
+        lbx=np.concatenate([np.tile(lower, count), np.full(horizon * nx, -np.inf), np.zeros(slacks)]),
+        ubx=np.concatenate([np.tile(upper, count), np.full(horizon * nx + slacks, np.inf)]),
         lbg=np.concatenate([np.zeros(nlp.equalities), np.full(nlp.inequalities, -np.inf)]),
         ubg=0.0,
     )
@@ -115,13 +119,13 @@ def ipopt_act(
     good = bool(nlp.solver.stats()["success"]) and bool(np.all(np.isfinite(found)))
     if not np.all(np.isfinite(found)):
         declared = np.array(nlp.fallback(theta, nominal, np.where(np.isfinite(now), now, 0.0))).ravel()
-        found, status = np.tile(declared, horizon), SolveStatus.FALLBACK
+        found, status = np.tile(declared, count), SolveStatus.FALLBACK
     else:
         status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
-    plan = np.clip(found, np.tile(lower, horizon), np.tile(upper, horizon))
+    plan = np.clip(found, np.tile(lower, count), np.tile(upper, count))
     u = plan[:nu]
     ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
-    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[size:]])
+    following = np.concatenate([*problem.layout.later(list(plan.reshape(count, nu))), memory.warm[size:]])
     info = Info(status, 0.0 if good else np.inf, int(nlp.solver.stats()["iter_count"]), now)
     return u, Memory(ahead, u, following), info
 
@@ -131,7 +135,7 @@ def _roll_out(
 ) -> NDArray[np.float64]:
     p = controller.parameters(theta, controller.model.nominal)
     x, out = now, []
-    for u in inputs.reshape(controller.horizon, -1):
+    for u in np.repeat(inputs.reshape(len(controller.input_blocks), -1), controller.input_blocks, axis=0):
         x = np.array(controller.model.f(x, u, p)).ravel()
         out.append(x)
     return np.concatenate(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Any
@@ -73,6 +73,11 @@ class Layout:
     def together(self, intervals: list[Any]) -> list[list[Any]]:
         """What stands for the intervals, a list a block."""
         return [intervals[a:b] for a, b in pairwise((0, *accumulate(self.blocks)))]
+
+    def later(self, blocks: Sequence[Any]) -> list[Any]:
+        """The input of each block of the same plan an interval later: the mean over the intervals that a block then covers."""
+        ahead = (*blocks[1:], blocks[-1])
+        return [b if length == 1 else (a * (length - 1) + b) / length for a, b, length in zip(blocks, ahead, self.blocks, strict=True)]
 
     def rows(self, vector: Any) -> tuple[list[Any], Any]:
         """(rows of each interval, those of the end) of a vector like c."""

@@ -1,8 +1,9 @@
 """The controller's problem, discretised, condensed and scaled, as CasADi functions of run-time values only.
 
-The states are eliminated (single shooting); the inputs U = (u_0 .. u_{N-1}) remain. ``sweep`` rolls the model out and
-linearises it stage by stage; ``quadratic`` condenses that to a dense QP for the scaled step v = (U+ - U) / range and
-the scaled slacks; ``residual`` measures optimality from the same linearisation without condensing it.
+The states are eliminated (single shooting); the inputs U remain, one for each block of intervals in which it is held.
+``sweep`` rolls the model out and linearises it stage by stage; ``quadratic`` condenses that to a dense QP for the scaled
+step v = (U+ - U) / range and the scaled slacks; ``residual`` measures optimality from the same linearisation without
+condensing it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from chargetune.control.optimality import adjoint, curvature, merit, residual, s
 
 __all__ = ["Problem", "control_problem", "row_weight"]
 
-STRAIGHT_MAX = int(__import__("os").environ.get("STRAIGHT", 20000))
+# Up to so many multiplications the functions of the whole horizon are straight-line code: episodes are then a seventh to two fifths quicker
+# than with loops and calls, but a compiler takes 1 s for each 1000 of them.
+STRAIGHT_MAX = 20_000
 
 
 @dataclass(frozen=True)
@@ -31,13 +34,13 @@ class Problem:
         (theta, setpoint, p_nominal) -> q, everything that is fixed over an episode (spline coefficients, weights):
         no other function sees theta or p.
     bounds
-        (now, q) -> (lower, upper), the input bounds repeated over the horizon, shapes (N nu,).
+        (now, q) -> (lower, upper), the input bounds repeated over the horizon, shapes (size,).
     sweep
         (now, U, q) -> (J, c, D): cost, scaled and weighted rows c(U) <= s, and the stages' derivatives packed in a vector.
     quadratic
         (U, c, D, lower, upper, W) -> (g, A', lba, uba, span, gamma): the QP of `control.qp`, one slack a limit. Its first
-        N nu rows are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J, and W, shape (N nu,),
-        is added to the diagonal of the stages' input Hessians.
+        rows, as many as inputs, are v = dU / span between the bounds, then c + dc less the slack; the cost is gamma J, and
+        W, shape (size,), is added to the diagonal of the blocks' input Hessians.
     curvature
         (now, U, D, multipliers, lower, upper, q) -> W: what constraints and dynamics add to that diagonal in the
         Lagrangian, where it is positive.
@@ -49,8 +52,8 @@ class Problem:
         (now, q) -> input, shape (nu,), before clipping.
     correct, predict
         The estimator: (memory, y, u, q) -> (x_hat, memory); (x_hat, memory, u, q) -> memory.
-    groups
-        For each row the index of its limit.
+    layout
+        Which numbers of U and c belong together.
     """
 
     controller: Controller
@@ -64,17 +67,22 @@ class Problem:
     fallback: ca.Function
     correct: ca.Function
     predict: ca.Function
-    groups: tuple[int, ...]
+    layout: Layout
 
     @property
     def size(self) -> int:
-        """Number of decision variables N nu."""
-        return int(self.sweep.size1_in(1))
+        """Number of decision variables, nu a block."""
+        return self.layout.size
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """For each row the index of its limit."""
+        return self.layout.groups
 
     @property
     def row_width(self) -> int:
         """Rows of c in one stage; the terminal rows follow after the last stage."""
-        return sum(limit.rows.size1_out(0) * (2 if limit.at == "both" else 1) for limit in self.controller.limits if limit.at != "terminal")
+        return len(self.layout.stage_groups)
 
 
 def row_weight(stage: int, horizon: int) -> float:
@@ -131,7 +139,7 @@ def control_problem(controller: Controller) -> Problem:
     final, final_packed = Linearisation.of(x, ca.SX(0, 1), ca.SX(0, 1), final_cost, final_rows)
     layout = Layout(
         nu=nu,
-        blocks=(1,) * horizon,
+        blocks=controller.input_blocks,
         stage_groups=(*_group(controller, "start", "both"), *_group(controller, "end", "both")),
         final_groups=_group(controller, "terminal"),
         prices=tuple(limit.penalty * limit.scale for limit in limits),
@@ -139,12 +147,16 @@ def control_problem(controller: Controller) -> Problem:
     packed_stage = ca.Function("stage", [x, u, now, q, weight], dense(after, stage_cost, stage_rows, stage_packed))
     follow = ca.Function("follow", [x, u, q], dense(after))
     packed_final = ca.Function("final", [x, now, q], dense(final_cost, final_rows, final_packed))
-    lean = straight if operations(layout, stage) <= STRAIGHT_MAX else _loops
+    short = operations(layout, stage) <= STRAIGHT_MAX
+
+    def lean(function: ca.Function) -> ca.Function:
+        return straight(function) if short else function
+
     scaled, adjoints = lean(scaling(layout, stage, final)), adjoint(stage, final)
     return Problem(
         controller=controller,
         prepare=ca.Function("prepare", [theta, setpoint, nominal], [prepared]),
-        bounds=ca.Function("bounds", [now, q], [ca.repmat(lower, horizon, 1), ca.repmat(upper, horizon, 1)]),
+        bounds=ca.Function("bounds", [now, q], [ca.repmat(bound, len(layout.blocks), 1) for bound in (lower, upper)]),
         sweep=_sweep(layout, packed_stage, packed_final),
         quadratic=lean(quadratic(layout, stage, final, scaled)),
         curvature=curvature(
@@ -160,7 +172,7 @@ def control_problem(controller: Controller) -> Problem:
         fallback=ca.Function("fallback", [now, q], [fallback]),
         correct=ca.Function("correct", [memory, y, u, q], dense(x_hat, corrected)),
         predict=ca.Function("predict", [x, memory, u, q], dense(predicted)),
-        groups=layout.groups,
+        layout=layout,
     )
 
 
@@ -178,7 +190,3 @@ def _sweep(layout: Layout, stage: ca.Function, final: ca.Function) -> ca.Functio
         derivatives.append(packed)
     final_cost, row, packed = final(x, now, q)
     return ca.Function("sweep", [now, inputs, q], [cost + final_cost, ca.vertcat(*rows, row), ca.vertcat(*derivatives, packed)])
-
-
-def _loops(function: ca.Function) -> ca.Function:
-    return function
