@@ -23,8 +23,9 @@ __all__ = ["operations", "quadratic", "scaling", "span_of"]
 REGULARISATION = 1e-8
 # A stage's function of at most so many multiplications is straight-line code: quicker than loops of a few turns, and compiled in a moment.
 STAGE_MAX = 1500
-# Sensitivities grow by a block a stage; as loops they have one of so many widths.
-WIDTHS = 4
+# Sensitivities grow by a block a stage. They move on in at most so many chunks: straight-line code where that is short, or loops.
+CHUNKS = 8
+CHUNKS_OF_LOOPS = 4
 
 
 def span_of(lower: Any, upper: Any) -> Any:
@@ -64,6 +65,7 @@ def quadratic(layout: Layout, stage: Linearisation, final: Linearisation, scalin
     root = ca.sqrt(gamma * ca.DM(layout.prices))
     bounds, jacobian = [], []
     chunk = _chunk(layout, stage)
+    nothing = _zeros(nu, nu * chunk)
     states: list[Any] = []
     for i, (scale, (inverse, law), (of, own)) in enumerate(zip(ranges, laws, blocks, strict=True)):
         if i % chunk == 0:
@@ -72,7 +74,7 @@ def quadratic(layout: Layout, stage: Linearisation, final: Linearisation, scalin
         for k, one in enumerate(states):
             width = one.shape[1]
             before = nu * (i - k * chunk)
-            new = ca.horzcat(_zeros(nu, before), inverse, _zeros(nu, width - nu - before)) if before < width else _zeros(nu, width)
+            new = ca.horzcat(_zeros(nu, before), inverse, _zeros(nu, width - nu - before)) if before < width else nothing
             states[k], move, row = forward(of, width)(one, own, scale, inverse, law, new)
             moved.append(move)
             seen.append(row)
@@ -127,8 +129,9 @@ def _column_operations(stage: Linearisation) -> int:
 
 def _chunk(layout: Layout, stage: Linearisation) -> int:
     """Blocks of columns that `_forward` moves on at once."""
-    straight_line = STAGE_MAX // (layout.nu * _column_operations(stage) * max(layout.blocks))
-    return straight_line if straight_line > 1 else ceil(len(layout.blocks) / WIDTHS)
+    short = STAGE_MAX // (layout.nu * _column_operations(stage) * max(layout.blocks))
+    count = len(layout.blocks)
+    return short if short * CHUNKS >= count else ceil(count / CHUNKS_OF_LOOPS)
 
 
 def _weigh(of: Linearisation) -> ca.Function:
