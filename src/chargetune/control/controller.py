@@ -107,6 +107,7 @@ class Controller:
 
     Inputs are bounded hard, everything else softly, so the problem always has a solution. l and Vf are to be convex
     in (x, u) and x (their Hessians are the curvature of the Gauss-Newton model). Build one with `Controller.build`.
+    ``blocks`` says for how many intervals each input is held; empty: u_i is free at every interval.
     ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement, ``fallback`` the input
     applied when the solver fails, both within the input bounds by clipping.
     """
