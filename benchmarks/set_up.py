@@ -2,12 +2,14 @@
 
 A linear system with dense random matrices, every limit a soft one on a state, quadratic costs. Each row is a fresh process with an empty
 cache: seconds from the model to the first episode of 100 steps (building, generating C, compiling with the library's flags, running), the
-size of the C, and milliseconds an episode afterwards. `vm` is the same without a compiler. Everything is of one run on one machine.
+size of the C, and milliseconds an episode afterwards, compiled or on CasADi's virtual machine. ``cpu_s`` is the same in seconds of the
+processor, the compiler's included, which others on the machine disturb less. Everything is of one run.
 """
 
 import argparse
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -79,6 +81,7 @@ def measure(nx, nu, horizon, limits, compiled):
     own = episode.compiled_episode(*loop(nx, nu, horizon, limits), STEPS, compiled=compiled)
     first = own.run()
     ready = time.perf_counter() - begin
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     times = []
     while len(times) < 3 or sum(times) < 1.0:
         begin = time.perf_counter()
@@ -92,6 +95,7 @@ def measure(nx, nu, horizon, limits, compiled):
         "compiled": compiled,
         "c_mb": round(size[0], 3) if compiled else None,
         "first_episode_s": round(ready, 2),
+        "cpu_s": round(sum(one.ru_utime + one.ru_stime for one in spent), 2),
         "episode_ms": round(1e3 * statistics.median(times), 3),
         "unsolved": int(np.sum(first.status != 0)),
     }

@@ -3,52 +3,18 @@
 import casadi as ca
 import numpy as np
 import pytest
-from systems import SPACE, controller, plant_model, random_point
+from systems import SPACE, controller, linear, plant_model, random_point
 
-from chargetune.control import ocp
+from chargetune.control import condensing, ocp
 from chargetune.control.control_step import act, begin, problem_of
-from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.control.ocp import control_problem
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
-from chargetune.model.model import Model, Signal
 from chargetune.plants.simulated import SimulatedPlant
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
-
-
-def linear(nx, nu, limits, seed=0, **changes):
-    """(controller, plant) of a stable linear system with dense random matrices and upper limits on its first states."""
-    draw = np.random.default_rng(seed)
-    a, b = draw.normal(size=(nx, nx)), draw.normal(size=(nx, nu))
-    a *= 0.95 / np.max(np.abs(np.linalg.eigvals(a)))
-    states, inputs = [f"x{i}" for i in range(nx)], [f"u{i}" for i in range(nu)]
-
-    def equations(x, u, p):
-        return dict(zip(states, ca.vertsplit(ca.mtimes(a, x.vector) + ca.mtimes(b, u.vector)), strict=True)), x
-
-    signals = [Signal(name) for name in states]
-    model = Model.build(
-        "linear",
-        states=signals,
-        inputs=[Signal(name) for name in inputs],
-        outputs=signals,
-        parameters={},
-        sampling_time_s=1.0,
-        equations=equations,
-    )
-    settings = {
-        "horizon": 30,
-        "stage_cost": lambda s: ca.sumsqr(s.x.vector - 0.3) + 0.1 * s.theta["t"] * ca.sumsqr(s.u.vector),
-        "terminal_cost": lambda s: 5 * ca.sumsqr(s.x.vector - 0.3),
-        "input_lower": dict.fromkeys(inputs, -0.3),
-        "input_upper": dict.fromkeys(inputs, 0.3),
-        "limits": [SoftLimit(name, upper=0.4, penalty=1e3, scale=0.1) for name in states[:limits]],
-        **changes,
-    }
-    return Controller.build(model, SPACE, **settings), SimulatedPlant(model, dict.fromkeys(states, 0.6))
 
 
 def test_twelve_states_four_inputs_thirty_intervals_are_as_ipopt_says():
@@ -62,21 +28,25 @@ def test_twelve_states_four_inputs_thirty_intervals_are_as_ipopt_says():
     assert np.any(ours.true_end[:, :6] > 0.399)
 
 
-@pytest.mark.parametrize("change", [{}, {"blocks": (1, 2, 3)}, {"limits": []}])
-def test_loops_and_straight_line_code_are_the_same_functions(monkeypatch, change):
-    own = controller("E", **change)
+@pytest.mark.parametrize("stage_max", [1500, 60, 0])
+@pytest.mark.parametrize("change", [{}, {"blocks": (1, 2, 3, 5)}, {"limits": []}, {"hessian": "exact"}, {"input_rate": {"force": 0.1}}])
+def test_loops_and_straight_line_code_are_the_same_functions(monkeypatch, change, stage_max):
+    """Chunks of sensitivities: all at once, several of straight-line code, several of loops."""
+    own = controller("E", **{"horizon": 11, **change})
     straight = control_problem(own)
     monkeypatch.setattr(ocp, "STRAIGHT_MAX", 0)
+    monkeypatch.setattr(condensing, "STAGE_MAX", stage_max)
     loops = control_problem(own)
     assert straight.quadratic.class_name() == "SXFunction"
     assert loops.quadratic.class_name() == "MXFunction"
     now, inputs, q, lower, upper = random_point(straight)
     _, rows, derivatives = straight.sweep(now, inputs, q)
     multipliers = np.random.default_rng(1).uniform(0.0, 2.0, len(straight.groups))
-    bend = np.random.default_rng(2).uniform(0.0, 1.0, straight.size)
     for name, given in {
-        "quadratic": (inputs, rows, derivatives, lower, upper, bend),
-        "curvature": (now, inputs, derivatives, multipliers, lower, upper, q),
+        "scaling": (derivatives, lower, upper),
+        "quadratic": (inputs, rows, derivatives, lower, upper, 0.7, 0.2),
+        "curvature": (now, inputs, derivatives, multipliers, q),
+        "convex": (derivatives, lower, upper),
         "residual": (inputs, rows, derivatives, multipliers, 0.7, lower, upper),
         "merit": (1.3, rows),
     }.items():

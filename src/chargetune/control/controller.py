@@ -37,9 +37,10 @@ class Controller:
         s.t. x_{i+1} = f(x_i, u_i), x_0 = estimate, input_lower <= u_i <= input_upper, limits on outputs and states
 
     Inputs are bounded hard, everything else softly, so the problem always has a solution. Build one with `Controller.build`.
-    ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement,
-    ``input_before`` the input before the first interval, ``fallback`` the input applied when the solver fails, within the
-    input bounds by clipping. ``given`` are signals whose values over the horizon are told at run time (`model.given`).
+    ``blocks`` says for how many intervals each input is held; empty: u_i is free at every interval. ``setpoint`` is (x_d, u_d),
+    ``start`` the estimator's state before the first measurement, ``input_before`` the input before the first interval, ``fallback``
+    the input applied when the solver fails, within the input bounds by clipping. ``given`` are signals whose values over the
+    horizon are told at run time (`model.given`).
 
     ``input_rate`` (inf: none) bounds the change of an input from one interval to the next, hard like the bounds:
 
