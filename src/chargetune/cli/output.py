@@ -73,6 +73,10 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) 
     table.add_column("")
     for key, label, unit in ROWS:
         table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
+    drawn = {name: s.metrics for name, s in scores.items() if s and "plants" in s.metrics}
+    if drawn:
+        counts = (f"{m['violating_plants']:.0f} of {m['plants']:.0f}" if (m := drawn.get(name)) else "-" for name in scores)
+        table.add_row("drawn plants over a limit; the figures above are their means, over a limit their worst", *counts, "")
     verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
     table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
     return table

@@ -63,7 +63,7 @@ class CompiledEpisode:
         self,
         thetas: Sequence[ArrayLike | None],
         plants: Sequence[SimulatedPlant],
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         tables: Sequence[NDArray[np.float64] | None] | None = None,
         *,
         given: Given | None = None,
@@ -71,35 +71,38 @@ class CompiledEpisode:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
         The plants have the model of ``plant`` with other parameters, starts or sensors, and all the same given signals. The same
-        episodes as of one after the other.
+        episodes as of one after the other. ``seed`` is one for all of them, or one each.
         What each of ``tables`` (`LookupTable`) says of the true outputs is added to what is measured, and so read by the estimator.
         Raises ValueError when there are not as many of all, or one does not fit.
         """
         tables = [None] * len(plants) if tables is None else tables
-        if not len(thetas) == len(plants) == len(tables):
-            raise ValueError(f"{len(thetas)} thetas, {len(plants)} plants and {len(tables)} tables, allowed are as many of each")
+        seeds = [seed] * len(plants) if isinstance(seed, int) else list(seed)
+        if not len(thetas) == len(plants) == len(tables) == len(seeds):
+            counts = f"{len(thetas)} thetas, {len(plants)} plants, {len(seeds)} seeds and {len(tables)} tables"
+            raise ValueError(f"{counts}, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
         # An ensemble has few thetas, slopes have few plants: what depends on one of them alone is computed once for each.
         of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
-        of_plant: dict[int, _OfPlant] = {}
+        of_plant: dict[tuple[int, int], _OfPlant] = {}
         told = self._told(given)
         fixed, unknown = [], []
-        for theta, plant, table in zip(thetas, plants, tables, strict=True):
+        for theta, plant, table, own in zip(thetas, plants, tables, seeds, strict=True):
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
                 of_theta[key] = self._of_theta(values, told)
-            if id(plant) not in of_plant:
-                check_run(plant, self.steps, seed, ())
-                of_plant[id(plant)] = self._of_plant(plant, seed, told)
-            fixed.append(self._given(of_theta[key], of_plant[id(plant)], table))
-            unknown.append(of_plant[id(plant)].unknown)
+            drawn = id(plant), own
+            if drawn not in of_plant:
+                check_run(plant, self.steps, own, ())
+                of_plant[drawn] = self._of_plant(plant, own, told)
+            fixed.append(self._given(of_theta[key], of_plant[drawn], table))
+            unknown.append(of_plant[drawn].unknown)
         run = partial(numpy_call, self.function)
         # The loops alone go into threads, as machine code: all else waits for the interpreter.
         recorded = parallel_map(run, fixed, unknown) if self.compiled and len(plants) > 1 else list(map(run, fixed, unknown))
-        return [self._episode(one, plant, seed) for (one,), plant in zip(recorded, plants, strict=True)]
+        return [self._episode(one, plant, own) for (one,), plant, own in zip(recorded, plants, seeds, strict=True)]
 
     def _arguments(
         self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip], told: NDArray[np.float64]

@@ -67,9 +67,14 @@ class ScoredLimit:
 
     def excess_at_ends(self, episode: Episode) -> NDArray[np.float64]:
         """The excess at both ends of each interval, shape (2, K); nan where it is not known."""
-        values = np.stack([moving_mean(_known(v), self.samples) for v in episode.signal(self.signal)])
-        above = -np.inf if self.upper is None else values - self.upper
-        below = -np.inf if self.lower is None else self.lower - values
+        values = _known(np.stack(episode.signal(self.signal)))
+        if self.samples > 1:
+            values = np.stack([moving_mean(v, self.samples) for v in values])
+        # One side costs no maximum: safe mode judges a thousand episodes for a proposal.
+        above = None if self.upper is None else values - self.upper
+        below = None if self.lower is None else self.lower - values
+        if above is None or below is None:
+            return np.asarray(below if above is None else above, dtype=np.float64)
         return np.asarray(np.maximum(above, below), dtype=np.float64)
 
 
@@ -91,10 +96,13 @@ class Windows:
     def of(self, episode: Episode) -> NDArray[np.int_]:
         """The window of each interval, shape (K,), from 0 on. Where the signal was lost it is what lies between its neighbours."""
         _, values = episode.signal(self.signal)
-        known, at = np.isfinite(values), np.arange(values.size)
+        known = np.isfinite(values)
         if not known.any():
             return np.zeros(values.size, dtype=np.int_)
-        share = (np.interp(at, at[known], values[known]) - self.lower) / (self.upper - self.lower)
+        if not known.all():
+            at = np.arange(values.size)
+            values = np.interp(at, at[known], values[known])
+        share = (values - self.lower) / (self.upper - self.lower)
         return np.clip(np.floor(share * self.count).astype(np.int_), 0, self.count - 1)
 
 
@@ -217,4 +225,5 @@ def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64
 
 
 def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float64)
+    finite = np.isfinite(values)
+    return values if finite.all() else np.asarray(np.where(finite, values, np.nan), dtype=np.float64)

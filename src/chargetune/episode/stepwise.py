@@ -16,7 +16,7 @@ from chargetune.control.first_guess import act_of, first_memory
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
 from chargetune.model.given import Given, actual, checked_given, windows
-from chargetune.plants.plant import Measurement, Plant, PlantError
+from chargetune.plants.plant import Measurement, Plant, PlantError, SetUpError
 from chargetune.runtime.numeric import is_integer
 
 __all__ = ["check_run", "run_episode", "signal_indices"]
@@ -69,6 +69,9 @@ def run_episode(
             broken = broken + 1 if info.status == SolveStatus.FALLBACK else 0
             if blind >= BLIND_MAX or broken >= BLIND_MAX or tripped(plant, measurement, trips):
                 break
+    except SetUpError:
+        # No interval of it could ever run, so there is no episode to tell of.
+        raise
     except PlantError as error:
         ending, message = Ending.PLANT, str(error)
     except KeyboardInterrupt:
@@ -99,7 +102,7 @@ def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
     """What the plant answers; anything it raises, and an answer of the wrong shape, is a `PlantError`."""
     try:
         measurement = call()
-    except PlantError:
+    except (PlantError, SetUpError):
         raise
     except Exception as error:
         raise PlantError(f"the plant raised {type(error).__name__}: {error}") from error
