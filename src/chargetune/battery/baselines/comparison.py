@@ -11,7 +11,7 @@ import numpy as np
 
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
 from chargetune.battery.charging.evaluate import plant_of, run_charge
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem, with_feedback
 from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
@@ -62,7 +62,10 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
     names += ["multi-step CC", "four-step CC (Attia)", "plant oracle"]
     if as_steppable(plant_of(problem)) is None:
         names = []
-    names += ["nominal MPC", "best constant backoff"]
+    names += ["nominal MPC"]
+    if problem.estimator.kind not in ("offset_free", "adaptive"):
+        names.append("offset-free MPC, untuned")
+    names.append("best constant backoff")
     if problem.plant is None:
         names.append("MPC with the true model")
     return [*names, *(["tuned"] if theta is not None else [])]
@@ -98,6 +101,7 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
             problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.cell.capacity_Ah)), voltage
         ),
         "plant oracle": lambda: _stepped(problem, name, constant_current(largest), list(problem.limits_by_name.values())),
+        "offset-free MPC, untuned": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
         "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
         "MPC with the true model": lambda: _judged(plain, name, run_charge(true, None, seed)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ import numpy as np
 
 from chargetune.battery.case_study.claims import SeedRun, decide
 from chargetune.battery.case_study.configurations import CASE_STUDIES, case_study
-from chargetune.battery.charging.evaluate import Evaluation
+from chargetune.battery.charging.evaluate import Evaluation, evaluate
+from chargetune.battery.charging.problem import ChargingProblem, with_feedback
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import TunerName, problem_of_document
 from chargetune.episode.episode import Episode
@@ -27,6 +28,9 @@ ATTAINABLE_T95_MIN: dict[str, tuple[float, ...]] = {
     "backoff": (46.2, 41.4, 38.9, 47.8, 44.5, 40.7, 44.6, 46.0),
     "model": (36.4, 36.8, 36.7, 36.7, 39.0, 36.5, 36.9, 36.8),
 }
+
+
+FIGURES = ("overshoot_mV", "t80_min", "t95_min", "t99_min", "switch_min")
 
 
 def reproduce(
@@ -92,13 +96,15 @@ def seed_row(case: str, seed: int, run: SeedRun) -> dict[str, Any]:
     """The row of one seed as it stands in claims.json."""
 
     def figures(*, tuned: bool) -> dict[str, float | None]:
-        return {name: run.metric(name, tuned=tuned) for name in ("overshoot_mV", "t80_min", "t95_min", "t99_min", "switch_min")}
+        return {name: run.metric(name, tuned=tuned) for name in FIGURES}
 
     known = ATTAINABLE_T95_MIN.get(case, ())
+    feedback = _with_feedback(run.problem)
     overshoots = [t.score.metrics["overshoot_mV"] for t in run.trials if t.score is not None]
     return {
         "seed": seed,
         "untuned": figures(tuned=False),
+        "offset_free": {name: feedback.get(name) for name in FIGURES},
         "tuned": None if run.tuned is None else figures(tuned=True),
         "tuned_trial": None if run.tuned is None else run.tuned.number,
         "tuned_feasible": run.tuned is not None and run.tuned.feasible,
@@ -109,6 +115,12 @@ def seed_row(case: str, seed: int, run: SeedRun) -> dict[str, Any]:
         "attainable_t95_min": known[seed] if seed < len(known) else None,
         "theta": None if run.tuned is None else list(run.tuned.theta),
     }
+
+
+def _with_feedback(problem: ChargingProblem) -> Mapping[str, float | None]:
+    """Figures of the untuned controller that reads the voltage: what needs no learning. Empty where it did not come to its end."""
+    score, _, _ = evaluate(with_feedback(problem), None, 0)
+    return {} if score is None else score.metrics
 
 
 def _studies(folder: Path, tuner: TunerName, seeds: Sequence[int]) -> Iterator[dict[str, SeedRun]]:

@@ -29,7 +29,7 @@ from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
 from chargetune.runtime.cache import built_once
 
-__all__ = ["ChargingProblem", "PlantModel", "judged_exactly", "stand_in"]
+__all__ = ["ChargingProblem", "PlantModel", "judged_exactly", "stand_in", "with_feedback"]
 
 
 class PlantModel(Protocol):
@@ -198,6 +198,11 @@ class ChargingProblem:
 @built_once(64)
 def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...]) -> ParameterSpace:
     return theta.space(nodes, dict(observer))
+
+
+def with_feedback(problem: ChargingProblem) -> ChargingProblem:
+    """The same problem, untuned, with the observer that reads the voltage (`OffsetFree`) instead of its own."""
+    return replace(problem, estimator=EstimatorSettings(kind="offset_free"), theta=Tunables(), safety=None)
 
 
 def judged_exactly(problem: ChargingProblem) -> ChargingProblem:
