@@ -130,6 +130,15 @@ def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
     assert "of 2" in text
 
 
+def test_a_campaign_tunes_it_as_tune_does(folder, trials):
+    (folder / "campaign.toml").write_text('[campaign]\nconfigs = ["use.toml"]\nseeds = [0]\ntrials = 1\n')
+    chargetune("campaign", folder / "campaign.toml", "--store", folder / "campaign.sqlite", "--workers", 1)
+    name = json.loads(chargetune("show", folder / "campaign.sqlite", "--json").stdout)["studies"][0]["name"]
+    (again,) = json.loads(chargetune("show", folder / "campaign.sqlite", "--study", name, "--json").stdout)["trials"]
+    assert again["theta"] == trials[0]["theta"]
+    assert again["metrics"] == trials[0]["metrics"]
+
+
 def test_compare_refuses_what_has_no_meaning_over_a_range(folder, tmp_path, refused):
     assert "--figure is given for a study with a table [range]" in refused("compare", folder / "use.toml", "--figure", tmp_path / "a.pdf")
     plain = tmp_path / "s.toml"

@@ -60,6 +60,24 @@ def test_the_found_theta_is_the_largest_that_the_worst_plant_allows():
     assert trials[-1].score.objective == pytest.approx(0.97 * trials[0].score.objective, rel=0.04)
 
 
+def test_a_violation_that_does_not_change_with_theta_is_left_behind():
+    """Above power 1.4 the input is saturated: the limit is broken, and no slope says in which direction it is kept."""
+    saturated = ct.Controller.build(
+        heater(1.0),
+        SPACE,
+        horizon=1,
+        stage_cost=lambda s: (s.u["u"] - s.theta["power"]) ** 2,
+        input_lower={"u": 0.0},
+        input_upper={"u": 1.4},
+    )
+    evaluation = ct.RangeEvaluation(loop(controller=saturated), 40)
+    score, _, _ = evaluation(np.array([1.9]), 100)
+    tried = SimpleNamespace(number=0, theta=np.array([1.9]), status="done", score=score, seed=100)
+    assert score.metrics["violating_plants"] > 0
+    (theta,) = ct.RangeTuner(evaluation, seed=0).ask(SPACE, [tried])
+    assert theta[0] == pytest.approx(LIMIT / (1.25 * (1 - 0.8**STEPS)), rel=0.02)
+
+
 def test_a_trial_is_judged_on_draws_that_nothing_was_chosen_on():
     evaluation = ct.RangeEvaluation(loop(), 40)
     tuner = ct.RangeTuner(evaluation, seed=0)

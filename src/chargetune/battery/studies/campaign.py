@@ -11,8 +11,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from chargetune.battery.charging.evaluate import Evaluation
-from chargetune.battery.studies.open_study import open_study
+from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config, read_tables
 from chargetune.study.result import Reason, StudyResult, read_result
 from chargetune.study.store.store import Store, StudyRecord
@@ -185,7 +184,7 @@ def _standing(future: Future[Standing], entry: Entry, kept: str | Path, losses: 
 
 def _turn(entry: Entry, kept: str | Path) -> Standing:
     """Batches of one study for a while, in a worker."""
-    evaluation = Evaluation(entry.config.problem(entry.folder))
+    evaluation = evaluation_of(entry.config.study.tuner, entry.config.problem(entry.folder))
     end = time.monotonic() + TURN_S
     wanted = entry.config.study.trials
     with Store(kept, busy_timeout_s=60.0) as store, open_study(store, entry.config, entry.folder) as study:

@@ -31,7 +31,8 @@ class RangeSettings:
     aim
         Share of a limit's tolerance that a plant may use; the rest is for plants that were not drawn.
     first, pool
-        Plants on which Sobol points are compared before the search begins, and how many: which is clearly worse shows on a few.
+        Plants on which starts of the search are compared, the worst of the last trial if there is one, and how many Sobol points are
+        among the starts: which is clearly worse shows on a few.
     iterations, gain
         Of the search, and the share of the objective that one has to win.
     """
@@ -75,9 +76,10 @@ class RangeTuner:
         """The next theta; of several all are the same one, since each is the best that is known."""
         check_count(n)
         done = [t for t in trials if t.score is not None]
-        plants = [*self.evaluation.loop.draw(self.settings.plants, self.seed), *self._worst(done)]
+        # The newest trial's worst plants come first: starts are compared on them.
+        plants = [*self._worst(done[::-1]), *self.evaluation.loop.draw(self.settings.plants, self.seed)]
         search = _RangeSearch(self.evaluation, space, plants, self.settings)
-        start = space.to_unit(np.array(done[-1].theta)) if done else self._first(space, search)
+        start = self._start(space, search, np.array(done[-1].theta) if done else space.default)
         return np.tile(space.from_unit(search.refine(start)), (n, 1))
 
     def _worst(self, trials: Sequence[TrialLike]) -> list[DrawnPlant]:
@@ -88,13 +90,14 @@ class RangeTuner:
             out += [one.plant for one in sorted(results, key=lambda one: -one.beyond)[: self.settings.added]]
         return out
 
-    def _first(self, space: ParameterSpace, search: _RangeSearch) -> NDArray[np.float64]:
-        """The best of theta_0, the two extreme corners and Sobol points on a few plants.
+    def _start(self, space: ParameterSpace, search: _RangeSearch, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The best of this theta, the two extreme corners and Sobol points on a few plants.
 
-        A start within the limits matters: where the input is saturated, a violation does not change with theta.
+        A start within the limits matters: where the input is saturated, a violation does not change with theta, and beside one that
+        cannot be mended all others would be let grow as large.
         """
         corners = [np.zeros(space.dimension), np.ones(space.dimension)]
-        points = [space.to_unit(space.default), *corners, *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
+        points = [space.to_unit(theta), *corners, *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
         return min(points, key=search.merit)
 
 
