@@ -205,7 +205,7 @@ def test_a_ramp_moves_its_disturbance_by_what_it_runs_along():
     np.testing.assert_allclose(after, [0.05 + 0.3 * 0.2 * 2.0, 2.0 * np.exp(-0.06 / 0.5)], atol=1e-14)
     np.testing.assert_allclose(np.array(timed.f(x, u, timed.nominal)).ravel()[2:], [0.05 + 2.0 * 2.0, 2.0], atol=1e-14)
     assert dict(along.parameters)["gauge_offset_rate_decay"] == (0.5,)
-    with pytest.raises(ValueError, match="decay = 0.0, allowed is a finite number > 0"):
+    with pytest.raises(ValueError, match=r"decay = 0\.0, allowed is a finite number > 0"):
         Ramp(decay=0.0)
     with pytest.raises(ValueError, match=r"ramps = \['upper_offset'\], allowed are gauge_offset"):
         with_disturbances(tanks(), outputs=("gauge",), ramps={"upper_offset": Ramp()})
