@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 from chargetune.battery.charging.limits import LimitSettings
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.settings import (
+    FILTERS,
     ControllerSettings,
     EpisodeSettings,
     EstimatorSettings,
@@ -34,6 +35,9 @@ def charging_problem(cell, mismatch_seed=0, **entries):
 
 def changed(problem, **entries):
     """The problem with other entries of its tables, or other whole fields (cell, plant, sensors, ..), checked once all are changed."""
+    # Settings of a filter are those of the estimator that has it.
+    filters = [name for name in FILTERS if entries.get(name) is not None]
+    entries = ({"kind": filters[0]} if filters else {}) | entries
     whole = {name: value for name, value in entries.items() if name not in TABLE_OF}
     for name, value in entries.items():
         if name in TABLE_OF:

@@ -8,7 +8,7 @@ from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.detectability import undetectable
-from chargetune.model.disturbances import with_disturbances
+from chargetune.model.disturbances import Ramp, with_disturbances
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
@@ -195,3 +195,17 @@ def test_two_disturbances_of_one_name_are_refused():
 def test_shapes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"states \(3,\) and inputs \(1,\)"):
         undetectable(tanks(), ("gauge",), np.zeros(3), np.zeros(1))
+
+
+def test_a_ramp_moves_its_disturbance_by_what_it_runs_along():
+    along = with_disturbances(tanks(), outputs=("gauge",), ramps={"gauge_offset": Ramp(lambda u, p: p["valve"] * u["pump"], decay=0.5)})
+    timed = with_disturbances(tanks(), outputs=("gauge",), ramps={"gauge_offset": Ramp()})
+    x, u = np.array([0.9, 0.4, 0.05, 2.0]), np.array([0.2])
+    after = np.array(along.f(x, u, along.nominal)).ravel()[2:]
+    np.testing.assert_allclose(after, [0.05 + 0.3 * 0.2 * 2.0, 2.0 * np.exp(-0.06 / 0.5)], atol=1e-14)
+    np.testing.assert_allclose(np.array(timed.f(x, u, timed.nominal)).ravel()[2:], [0.05 + 2.0 * 2.0, 2.0], atol=1e-14)
+    assert dict(along.parameters)["gauge_offset_rate_decay"] == (0.5,)
+    with pytest.raises(ValueError, match=r"decay = 0\.0, allowed is a finite number > 0"):
+        Ramp(decay=0.0)
+    with pytest.raises(ValueError, match=r"ramps = \['upper_offset'\], allowed are gauge_offset"):
+        with_disturbances(tanks(), outputs=("gauge",), ramps={"upper_offset": Ramp()})

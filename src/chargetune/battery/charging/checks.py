@@ -129,7 +129,7 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
                     "warning",
                     f"{ratio.name(of)} has next to no influence: the overpotential is measured at every step, which replaces what {of} "
                     f"predicts; over its whole range the worst voltage moves by {ranges['exact']:.0f} mV (by "
-                    f"{ranges['model']:.0f} mV if the model propagated it)",
+                    f"{ranges['open_loop']:.0f} mV if the model propagated it)",
                     'estimator.kind = "open_loop" (an overpotential cannot be measured on a real cell), or tune R0 or a backoff instead',
                     {"range_measured_mV": ranges["exact"], "range_propagated_mV": ranges["open_loop"]},
                     Evidence(f"factor on {of}", "worst voltage over the limit (mV)", curves, {"limit": 0.0}),
