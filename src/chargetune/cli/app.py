@@ -64,6 +64,17 @@ Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 
 
 @app.command()
+def init(
+    path: Annotated[Path, typer.Argument(help="Study file to write.")] = Path("study.toml"),
+    cell: Annotated[Path | None, typer.Option(help="Cell file, as `identify` writes it.")] = None,
+) -> None:
+    """Write a commented study file that runs."""
+    from chargetune.cli.init import init_command
+
+    init_command(path, cell=cell)
+
+
+@app.command()
 def tune(
     config: ConfigFile,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials in all; the file's number by default.")] = None,

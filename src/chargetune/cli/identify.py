@@ -70,6 +70,7 @@ def identify_command(
         line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
         screen.print(line, markup=False, soft_wrap=True)
     screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
+    screen.print(f"next: put the limits of its data sheet into it, then chargetune init --cell {out}", markup=False, soft_wrap=True)
 
 
 def _check(found: Identification, record: Record) -> tuple[float, float, float]:

@@ -1,0 +1,37 @@
+"""A first study file, as a user gets it."""
+
+from pathlib import Path
+
+from commands import chargetune
+
+from chargetune.battery.studies.study_file import load_config
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_it_writes_a_study_that_reads_the_voltage_and_has_a_range(tmp_path):
+    path = tmp_path / "mine.toml"
+    out = chargetune("init", path)
+    assert f"next: chargetune check {path}" in out.stdout
+    problem = load_config(path).problem(tmp_path)
+    assert problem.estimator.kind == "offset_free"
+    assert problem.range is not None
+    assert problem.space.dimension > 0
+
+
+def test_it_overwrites_nothing(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("mine")
+    out = chargetune("init", path, code=2)
+    assert "exists, allowed is the name of a new file" in out.stderr
+    assert path.read_text() == "mine"
+
+
+def test_the_cell_file_is_found_from_where_the_study_lies(tmp_path):
+    folder = tmp_path / "studies"
+    folder.mkdir()
+    (tmp_path / "cell.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
+    chargetune("init", folder / "mine.toml", "--cell", tmp_path / "cell.toml")
+    config = load_config(folder / "mine.toml")
+    assert config.cell.file == "../cell.toml"
+    assert config.problem(folder).controller.current_ramp_A_s > 0
