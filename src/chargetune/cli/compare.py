@@ -104,7 +104,8 @@ def _over_range(
     screen, table = console(), Table(box=None, pad_edge=False)
     for heading in ("", "chosen", "over a limit", *(f"worst {limit}" for limit in limits), "mean t80 min", "mean t90 min", "t80 / oracle"):
         table.add_column(heading, justify="left" if heading in ("", "chosen") else "right")
-    table.columns[0].no_wrap = table.columns[2].no_wrap = True
+    for column in table.columns[: 3 + len(limits)]:
+        column.no_wrap = True
     for one in facts:
         worst = (_excess(limit, one["worst_excess"][limit]) for limit in limits)
         times = (number(one["mean_t80_min"]), number(one["mean_t90_min"]), number(one["ratio"], 3))

@@ -46,7 +46,7 @@ class ChargingRangeSettings:
     voltage_bias_V
         The voltage sensor reads too much by +- this; new in each charge.
     draws
-        Fresh draws of one trial of the tuner "range". With none of 300 over a limit at most 1 % are, with confidence 95 %.
+        Fresh draws of one trial of the tuner "range": where 1 % of all plants break a limit, 300 show one with probability 0.95.
 
     Raises ValueError naming field, value and what is allowed.
     """
