@@ -17,9 +17,9 @@ from learning import arguments, measure, run
 PARTS: dict[str, Mapping[str, Any]] = {
     "nothing": {},
     # The discrepancy is as large as it is stated, whatever predictions said.
-    "its scale": {"scale_sd": 1e-3, "scales": 1},
+    "its scale": {"scale_sd": 1e-3},
     # Every plant has the discrepancy at the median of its scale.
-    "its scales": {"scales": 1},
+    "its scales": {"scale_share": 0.5},
     # Residuals of neighbouring bins are told to be independent.
     "correlated bins": {"correlated_bins": 1.0},
     # One fit with a discrepancy taken from residuals, instead of two.

@@ -29,22 +29,30 @@ if TYPE_CHECKING:
     from chargetune.learning.black_box.expected_improvement import ExpectedImprovement
     from chargetune.learning.closed_loop.iterative_learning import IterativeLearning
     from chargetune.learning.initial_design import Sobol
+    from chargetune.learning.range_of_use.range_loop import SimulatedRange
+    from chargetune.learning.range_of_use.range_tuner import RangeSettings, RangeTuner
+    from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.twin.settings import TwinSettings
     from chargetune.learning.twin.simulated_twin import SimulatedTwin
     from chargetune.learning.twin.twin import Twin, Uncertain
     from chargetune.learning.twin_tuner import TwinTuner
     from chargetune.model.disturbances import with_disturbances
+    from chargetune.model.do_mpc import from_do_mpc
     from chargetune.model.integrators import rk4
     from chargetune.model.model import Model, Signal
     from chargetune.model.parameter_space import Parameter, ParameterSpace
+    from chargetune.plants.gymnasium import GymnasiumPlant
+    from chargetune.plants.range_of_use import RangeOfUse
     from chargetune.plants.sensors import Sensors
     from chargetune.plants.simulated import SimulatedPlant
+    from chargetune.plants.variation import Choice, LogNormal, Normal, Uniform, Variation
     from chargetune.study.store.store import Store
     from chargetune.study.study import Study
     from chargetune.study.warm_start import Earlier
 
 __all__ = [
+    "Choice",
     "Composite",
     "ConstrainedLogEI",
     "Controller",
@@ -55,18 +63,26 @@ __all__ = [
     "ExactState",
     "ExpectedImprovement",
     "ExtendedKalman",
+    "GymnasiumPlant",
     "IterativeLearning",
+    "LogNormal",
     "Model",
     "NoSafeThetaError",
+    "Normal",
     "Parameter",
     "ParameterSpace",
     "Propagated",
+    "RangeEvaluation",
+    "RangeOfUse",
+    "RangeSettings",
+    "RangeTuner",
     "Safety",
     "Score",
     "ScoredLimit",
     "Sensors",
     "Signal",
     "SimulatedPlant",
+    "SimulatedRange",
     "SimulatedTwin",
     "Sobol",
     "SoftLimit",
@@ -78,8 +94,11 @@ __all__ = [
     "TwinSettings",
     "TwinTuner",
     "Uncertain",
+    "Uniform",
+    "Variation",
     "Windows",
     "__version__",
+    "from_do_mpc",
     "identify",
     "load_config",
     "open_study",
@@ -94,6 +113,7 @@ __all__ = [
 __version__ = "0.1.0"
 
 _MODULES = {
+    "Choice": "plants.variation",
     "Composite": "learning.black_box.composite",
     "ConstrainedLogEI": "learning.black_box.constrained_ei",
     "Controller": "control.controller",
@@ -104,18 +124,26 @@ _MODULES = {
     "ExactState": "control.estimators",
     "ExpectedImprovement": "learning.black_box.expected_improvement",
     "ExtendedKalman": "control.kalman",
+    "GymnasiumPlant": "plants.gymnasium",
     "IterativeLearning": "learning.closed_loop.iterative_learning",
+    "LogNormal": "plants.variation",
     "Model": "model.model",
     "NoSafeThetaError": "learning.safety",
+    "Normal": "plants.variation",
     "Parameter": "model.parameter_space",
     "ParameterSpace": "model.parameter_space",
     "Propagated": "control.estimators",
+    "RangeEvaluation": "learning.range_of_use.range_verdict",
+    "RangeOfUse": "plants.range_of_use",
+    "RangeSettings": "learning.range_of_use.range_tuner",
+    "RangeTuner": "learning.range_of_use.range_tuner",
     "Safety": "learning.safety",
     "Score": "episode.score",
     "ScoredLimit": "episode.score_limits",
     "Sensors": "plants.sensors",
     "Signal": "model.model",
     "SimulatedPlant": "plants.simulated",
+    "SimulatedRange": "learning.range_of_use.range_loop",
     "SimulatedTwin": "learning.twin.simulated_twin",
     "Sobol": "learning.initial_design",
     "SoftLimit": "control.controller",
@@ -127,7 +155,10 @@ _MODULES = {
     "TwinSettings": "learning.twin.settings",
     "TwinTuner": "learning.twin_tuner",
     "Uncertain": "learning.twin.twin",
+    "Uniform": "plants.variation",
+    "Variation": "plants.variation",
     "Windows": "episode.score_limits",
+    "from_do_mpc": "model.do_mpc",
     "identify": "battery.identification.pulse_fit",
     "load_config": "battery.studies.study_file",
     "open_study": "battery.studies.open_study",

@@ -34,7 +34,7 @@ def inputs(weights):
     ],
 )
 def test_entries_without_influence(weights, idle, severity, controller, monkeypatch):
-    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _: np.array([0.5]))
+    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _, given=None: np.array([0.5]))
     found = check_influence(inputs(weights), controller)
     if idle is None:
         assert found == []
@@ -47,13 +47,13 @@ def test_entries_without_influence(weights, idle, severity, controller, monkeypa
 
 
 def test_an_influence_elsewhere_than_at_the_default_counts(controller, monkeypatch):
-    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _: np.array([0.5]))
+    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _, given=None: np.array([0.5]))
     # b[0] acts only while a is above its default.
     assert check_influence(lambda t: np.array([[t[2] + t[0] + max(0.0, t[0] - 0.2) * t[1]]]), controller) == []
 
 
 def test_an_episode_that_ends_early_is_a_change(controller, monkeypatch):
-    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _: np.array([0.5]))
+    monkeypatch.setattr("chargetune.checks.influence._ranges", lambda _, given=None: np.array([0.5]))
     found = check_influence(lambda t: np.zeros((4 if t[0] < 0.9 else 2, 1)), controller)
     assert found[0].message.startswith("b: ")
 

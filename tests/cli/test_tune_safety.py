@@ -25,6 +25,8 @@ tuner = "{tuner}"
 trials = 3
 [controller]
 mismatch_seed = 1
+[episode]
+steps = 240
 [sensors]
 voltage_noise_sd_V = 0.002
 [objective]

@@ -106,7 +106,7 @@ def ipopt_solution(own, now, inputs):
     rest = own.horizon * nx
     found = nlp.solver(
         x0=np.concatenate([inputs, np.tile(now, own.horizon), np.zeros(limits)]),
-        p=np.concatenate([now, own.theta.default, own.setpoint, own.model.nominal]),
+        p=np.concatenate([now, own.theta.default, own.setpoint, own.model.nominal, own.input_before]),
         lbx=np.concatenate([np.full(size, -0.9), np.full(rest, -np.inf), np.zeros(limits)]),
         ubx=np.concatenate([np.full(size, 0.9), np.full(rest + limits, np.inf)]),
         lbg=np.concatenate([np.zeros(rest), np.full(nlp.inequalities, -np.inf)]),

@@ -22,10 +22,10 @@ def differences(function, at, step=1e-6):
 
 def coordinates(problem, inputs, rows, derivatives, lower, upper):
     """(g, T, rows of A, lba, uba, span, gamma) of the QP with v = T e and the slacks apart."""
-    flat = np.zeros(problem.size)
-    g, columns, lba, uba, span, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, flat))
+    gamma = problem.scaling(derivatives, lower, upper)
+    g, columns, lba, uba, span = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma))
     slacks, size = len(problem.controller.limits), problem.size
-    return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma[0, 0])
+    return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma)
 
 
 @pytest.mark.parametrize("slot", ["l", "X", "E"])
@@ -50,9 +50,10 @@ def test_slacks_stand_against_their_rows_with_the_penalty_as_price():
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    g, columns, *_, gamma = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size)))
+    gamma = float(problem.scaling(derivatives, lower, upper))
+    g, columns, *_ = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma))
     for j, limit in enumerate(own.limits):
-        price = float(gamma[0, 0]) * limit.penalty * limit.scale
+        price = gamma * limit.penalty * limit.scale
         # s = e / sqrt(price) costs price (s + s^2 / 2).
         assert g[j, 0] == pytest.approx(np.sqrt(price))
         wanted = [0.0] * problem.size + [-1 / np.sqrt(price) if group == j else 0.0 for group in problem.groups]
@@ -82,30 +83,84 @@ def test_transformed_hessian_is_gauss_newton_by_dense_algebra():
     np.testing.assert_allclose(transform.T @ scaled @ transform, np.eye(problem.size), atol=1e-5)
 
 
+def hessian_of(problem, inputs, rows, derivatives, lower, upper):
+    """The Hessian of the QP in the inputs, from its coordinates: v = T e and |e|^2 / 2."""
+    _, transform, *_, span, gamma = coordinates(problem, inputs, rows, derivatives, lower, upper)
+    back = np.linalg.inv(transform) / span
+    return back.T @ back / gamma
+
+
 def test_curvature_is_that_of_the_lagrangian_in_each_input():
     """load = 0.8 force + speed^2 at the end of each interval: bent in the force of its own interval by the speed it brings."""
     own = controller("Y", limits=[SoftLimit("load", upper=0.6, at="end")])
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    gamma = float(problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size))[-1])
     multipliers = np.random.default_rng(0).uniform(0.0, 2.0, len(problem.groups))
-
-    def lagrangian(at):
-        cost, c, _ = problem.sweep(now, at, q)
-        return gamma * float(cost) + multipliers @ np.array(c).ravel()
-
-    step, found = 1e-3, np.array(problem.curvature(now, inputs, derivatives, multipliers, lower, upper, q)).ravel()
-    last = np.zeros(problem.size)
-    last[-1] = step
+    bent = problem.curvature(now, inputs, derivatives, multipliers, q)
+    added = [hessian_of(problem, inputs, rows, d, lower, upper) for d in (derivatives, bent)]
+    found = np.diag(added[1] - added[0])
     # At the last stage the Lagrangian's curvature is the stage's own and that of the costs, 0.2 for the force and 10 at the end.
-    total = (lagrangian(inputs + last) - 2 * lagrangian(inputs) + lagrangian(inputs - last)) / step**2
+    total = second_differences(lagrangian(problem, now, q, multipliers), inputs)[-1, -1]
     ahead = differences(lambda u: np.array([own_position(own, now, u)]), inputs)[0, -1]
-    assert found[-1] == pytest.approx(total - gamma * (0.2 + 10 * ahead**2), rel=1e-4, abs=1e-6)
+    assert found[-1] == pytest.approx(total - (0.2 + 10 * ahead**2), rel=1e-3)
     assert found[-1] > 0
-    assert np.all(found >= 0)
-    flat, bent = (np.array(problem.quadratic(inputs, rows, derivatives, lower, upper, w)[0]).ravel() for w in (0 * found, found))
-    assert np.max(np.abs(flat - bent)) > 1e-6
+    assert np.all(found >= -1e-6)
+
+
+def test_exact_hessian_is_that_of_the_lagrangian():
+    """With inputs that push outwards it is positive definite, and nothing of it is changed."""
+    own = controller("Y", limits=[SoftLimit("load", upper=0.6, at="end")], hessian="exact")
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    multipliers = np.random.default_rng(0).uniform(0.0, 2.0, len(problem.groups))
+    wanted = second_differences(lagrangian(problem, now, q, multipliers), inputs)
+    assert np.linalg.eigvalsh(wanted)[0] > 0
+    found = hessian_of(problem, inputs, rows, problem.curvature(now, inputs, derivatives, multipliers, q), lower, upper)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-4 * np.max(np.abs(wanted)))
+    straight = hessian_of(problem, inputs, rows, derivatives, lower, upper)
+    assert np.max(np.abs(straight - wanted)) > 0.01 * np.max(np.abs(wanted))
+
+
+def test_a_hessian_that_is_bent_downwards_is_turned_upwards():
+    own = controller("Y", stage_cost=lambda s: -(s.u["force"] ** 2) + 0.1 * s.x["position"] ** 2, terminal_cost=lambda s: 0.0, limits=[])
+    assert own.hessian == "exact"
+    problem = problem_of(own)
+    now, inputs, q, lower, upper = random_point(problem)
+    _, rows, derivatives = problem.sweep(now, inputs, q)
+    bent = problem.curvature(now, inputs, derivatives, np.zeros(0), q)
+    wanted = second_differences(lagrangian(problem, now, q, np.zeros(0)), inputs)
+    assert np.all(np.diag(wanted) < 0)
+    assert np.linalg.eigvalsh(hessian_of(problem, inputs, rows, bent, lower, upper))[0] > 0
+
+
+def lagrangian(problem, now, q, multipliers):
+    def value(at):
+        cost, c, _ = problem.sweep(now, at, q)
+        return float(cost) + multipliers @ np.array(c).ravel()
+
+    return value
+
+
+def second_differences(function, at, step=1e-3):
+    size = at.size
+    unit = step * np.eye(size)
+    return np.array(
+        [
+            [
+                (
+                    function(at + unit[i] + unit[j])
+                    - function(at + unit[i] - unit[j])
+                    - function(at - unit[i] + unit[j])
+                    + function(at - unit[i] - unit[j])
+                )
+                / (4 * step**2)
+                for j in range(size)
+            ]
+            for i in range(size)
+        ]
+    )
 
 
 def own_position(own, now, inputs):
@@ -124,7 +179,7 @@ def test_residual_is_zero_where_ipopt_says_it_is_optimal_and_nowhere_near(seed):
 
     def residual(at, duals):
         _, rows, derivatives = problem.sweep(now, at, q)
-        gamma = problem.quadratic(at, rows, derivatives, lower, upper, np.zeros(problem.size))[-1]
+        gamma = problem.scaling(derivatives, lower, upper)
         return float(problem.residual(at, rows, derivatives, float(gamma) * 0.1 * duals, gamma, lower, upper))
 
     assert residual(best, multipliers) < 1e-5
@@ -141,7 +196,7 @@ def test_residual_sees_a_multiplier_of_an_unused_row():
     now, _, q, lower, upper = random_point(problem)
     inputs, *_ = solver(problem)(now, cold(problem, np.zeros(1)), q)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    gamma = problem.quadratic(inputs, rows, derivatives, lower, upper, np.zeros(problem.size))[-1]
+    gamma = problem.scaling(derivatives, lower, upper)
     none, both = np.zeros(2 * own.horizon), np.zeros(2 * own.horizon)
     both[:2] = 0.3
     assert float(problem.residual(inputs, rows, derivatives, none, gamma, lower, upper)) <= KKT_TOLERANCE

@@ -75,7 +75,7 @@ def test_excess_tolerance_and_profile_by_hand():
     assert score.objective == 2.5
     # Half a tolerance beyond the tolerance, at a penalty of 1.
     assert score.performance == pytest.approx(2.5 - 0.5)
-    assert score.metrics == {"count": 4.0}
+    assert score.metrics == {"unsolved_percent": 0.0, "count": 4.0}
     assert not score.feasible
 
 

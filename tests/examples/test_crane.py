@@ -72,3 +72,15 @@ def test_a_move_that_the_user_interrupted_says_nothing_of_theta(example):
 
     with pytest.raises(KeyboardInterrupt):
         evaluate_trial(evaluate, tuple(crane["SPACE"].default), 0)
+
+
+def test_one_theta_keeps_every_crane_of_the_range(example, tmp_path):
+    crane = example("range_crane")
+    few = crane["ct"].RangeSettings(plants=16, pool=8, iterations=8)
+    trials, best = crane["tune"](2, 60, tmp_path / "cranes.sqlite", few)
+    assert best.score.metrics["violating_plants"] == 0
+    assert best.score.metrics["plants"] == 60
+    # The untuned controller believes in a rope that is too short for all of them.
+    untuned, _, _ = crane["ct"].RangeEvaluation(crane["LOOP"], 60)(crane["SPACE"].default, 0)
+    assert untuned.metrics["violating_plants"] > 30
+    assert len(trials) == 2

@@ -11,6 +11,7 @@ import pytest
 from chargetune.learning.twin.settings import TwinSettings
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+FEW = TwinSettings(plants=16, judges=32, rounds=3, pool=8)
 KEYS = {
     "method", "plant", "study", "noise_mV", "trials", "solved", "of", "t95_ratio_median", "t95_ratio_worst",
     "violating_trials", "all_trials", "worst_excess_mV", "ask_s_median",
@@ -41,7 +42,7 @@ def run_here(monkeypatch, capsys):
 
 def test_a_short_run_and_its_figure(tmp_path, run_here):
     cache = tmp_path / "attainable.json"
-    done = run("learning.py", "--study", "r0", "--methods", "safe,sobol", "--seeds", "1:2", "--trials", 2, "--json", "--cache", cache)
+    done = run("learning.py", "--study", "r0", "--methods", "ilc,sobol", "--seeds", "1:2", "--trials", 2, "--json", "--cache", cache)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
     assert len(rows) == 4
@@ -49,8 +50,10 @@ def test_a_short_run_and_its_figure(tmp_path, run_here):
     # 36.7 min is what 4000 evaluations of CMA-ES reach on this plant.
     assert abs(json.loads(cache.read_text())["ecm r0 1"] - 36.7) < 0.2
     worst = {(row["method"], row["trials"]): row["worst_excess_mV"] for row in rows}
-    assert worst["safe", 2] < 1.0 < worst["sobol", 2]
     assert [row["all_trials"] for row in rows] == [1, 2, 1, 2]
+    # A learner that promises the limit keeps it; few plants are enough to see it.
+    learnt = runpy.run_path(str(BENCHMARKS / "learning.py"))["run"]("ecm", "r0", 0.002, 2, ("safe", 1), FEW)
+    assert max(learnt["excess_mV"]) < 1.0 < worst["sobol", 2]
 
     printed, figure = tmp_path / "rows.json", tmp_path / "learning.png"
     printed.write_text(done.stdout)

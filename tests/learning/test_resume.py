@@ -12,7 +12,7 @@ from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
-from chargetune.learning import Composite, IterativeLearning, Safety, TwinTuner
+from chargetune.learning import Composite, ConstrainedLogEI, ExpectedImprovement, IterativeLearning, Safety, TwinTuner
 from chargetune.learning.twin.settings import TwinSettings
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
@@ -23,7 +23,7 @@ PROBLEM = charging_problem(
     default_cell(), mismatch_seed=1, R0=ResistanceRatio(0.1, 4.0, scale=True), voltage_noise_sd_V=0.002,
     soc_start=0.7, steps=24, verdict_samples=3,
 )  # fmt: skip
-FEW = TwinSettings(plants=16, judges=32, scales=4, rounds=3)
+FEW = TwinSettings(plants=16, judges=32, rounds=3)
 
 
 def filled(theta, seed):
@@ -36,6 +36,8 @@ def filled(theta, seed):
 TUNERS = {
     "twin": (lambda: TwinTuner(ToyLoop(), seed=2, settings=FEW), 4, 2),
     "safe": (lambda: TwinTuner(ToyLoop(), seed=2, safety=Safety(), settings=FEW), 4, 2),
+    "default": (lambda: ConstrainedLogEI(seed=2, n_initial=2), 5, 4),
+    "expected_improvement": (lambda: ExpectedImprovement(seed=2, n_initial=2), 5, 4),
     "composite": (lambda: Composite(ChargingWindows(PROBLEM), seed=2, n_initial=2), 6, 4),
     "iterative_learning": (lambda: IterativeLearning(ChargingTwin(PROBLEM)), 5, 2),
 }
@@ -43,7 +45,7 @@ TUNERS = {
 
 def go_on(path, name, count):
     """Run the study ``name`` up to ``count`` trials with a tuner of its own; its thetas and traces."""
-    toy = name in ("twin", "safe")
+    toy = name not in ("composite", "iterative_learning")
     with (
         Store(path) as store,
         Study.create_or_resume(store, name, config={}, space=TOY if toy else PROBLEM.space, tuner=TUNERS[name][0](), seed=5) as study,

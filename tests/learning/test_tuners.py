@@ -1,8 +1,5 @@
 """What holds for every tuner, and how well each does."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -63,17 +60,6 @@ def test_a_tuner_is_a_pure_function_of_the_trials(tuner, count, n, told):
     assert first.shape == (n, 3)
     assert np.all((first >= SPACE.lower) & (first <= SPACE.upper))
     assert len(np.unique(first, axis=0)) == n
-
-
-def test_another_process_proposes_the_same(told):
-    code = (
-        "import sys; sys.path.insert(0, {folder!r}); import numpy as np; from test_tuners import *; from conftest import told\n"
-        "make = told.__wrapped__() if hasattr(told, '__wrapped__') else told._fixture_function()\n"
-        "print(repr(ConstrainedLogEI(seed=3).ask(SPACE, history(make, ConstrainedLogEI(seed=3), 12)).tolist()))"
-    ).format(folder=str(__file__).rsplit("/", 1)[0])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    here = ConstrainedLogEI(seed=3).ask(SPACE, history(told, ConstrainedLogEI(seed=3), 12)).tolist()
-    assert done.stdout.strip() == repr(here)
 
 
 @pytest.mark.parametrize("tuner", LEARNING)
@@ -152,8 +138,8 @@ def best(trials):
 
 
 def test_the_default_finds_a_constrained_optimum_and_beats_sobol(run):
-    found = [best(run(ConstrainedLogEI(seed=s), SPACE, corner, 22)) for s in range(3)]
-    baseline = [best(run(Sobol(seed=s), SPACE, corner, 22)) for s in range(3)]
+    found = [best(run(ConstrainedLogEI(seed=s), SPACE, corner, 18)) for s in range(3)]
+    baseline = [best(run(Sobol(seed=s), SPACE, corner, 18)) for s in range(3)]
     assert np.median(found) > 0.98 * np.sqrt(2) * 0.8
     assert np.median(found) > np.median(baseline)
 
@@ -162,7 +148,7 @@ def test_expected_improvement_finds_an_unconstrained_optimum_and_beats_sobol(run
     def function(theta):
         return bowl(theta)[0], None
 
-    found = [best(run(ExpectedImprovement(seed=s), SPACE, function, 20)) for s in range(3)]
-    baseline = [best(run(Sobol(seed=s), SPACE, function, 20)) for s in range(3)]
+    found = [best(run(ExpectedImprovement(seed=s), SPACE, function, 14)) for s in range(3)]
+    baseline = [best(run(Sobol(seed=s), SPACE, function, 14)) for s in range(3)]
     assert np.median(found) > -2e-3
     assert np.median(found) > np.median(baseline)

@@ -9,9 +9,10 @@ from study_toy import CONFIG, SEED, SPACE, Halfway, Toy, ToyEpisode, essence, op
 
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import Parameter, ParameterSpace
+from chargetune.plants.plant import SetUpError
 from chargetune.study.evaluation import trial_seed
 from chargetune.study.store.store import Store, StoreError
-from chargetune.study.study import StudyError
+from chargetune.study.study import SAME_FAILURES, StudyError
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 
 GOOD = Score(1.0, 1.0, {"v": -0.1}, {"v": 0.0})
@@ -258,9 +259,7 @@ def test_best_takes_the_feasible_one_and_the_earlier_of_equals():
         ((None, ToyEpisode(np.ones(3)), "sensor: voltage is nan"), "sensor: voltage is nan"),
         ((GOOD, None, None), "ValueError: ending = None"),
         ((GOOD, None), "ValueError: not enough values"),
-        ((GOOD, "text", "done"), "AttributeError: "),
         ((1.0, None, "done"), "ValueError: score = 1.0"),
-        (None, "TypeError: "),
     ],
 )
 def test_what_evaluate_gives_wrong_is_a_failed_trial_without_numbers(store, result, reason):
@@ -417,3 +416,50 @@ def test_config_of_the_toy_is_stored(store):
         assert trial.provenance["study_sha256"] == study.record.identity_sha256
         assert trial.provenance["versions"]["numpy"] == np.__version__
         assert Parameter(**{**study.record.identity["space"][1], "default": (1.0,)}) == SPACE.parameters[1]
+
+
+def misspelt(theta, seed):
+    return undefined_name(theta, seed)  # noqa: F821 - the error of a program that is tested here
+
+
+def refused(theta, seed):
+    raise SetUpError("plant: parameters = 'none', allowed is one that there is")
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+@pytest.mark.parametrize(("evaluate", "reason"), [(misspelt, "NameError: name 'undefined_name' is not defined"), (refused, "plant: par")])
+def test_an_error_that_no_theta_could_avoid_ends_the_study_and_burns_no_trial(store, evaluate, reason, workers):
+    with open_study(store) as study:
+        with pytest.raises(SetUpError) as caught:
+            study.run(evaluate, 6, workers=workers)
+        assert str(caught.value).startswith(reason)
+        assert evaluate.__name__ in caught.value.details, "the traceback names the line"
+        assert all(t.status == "running" for t in study.trials())
+        # Mended, the same call goes on from there.
+        study.run(Toy(), 4, workers=workers)
+        assert [t.number for t in study.trials() if t.status != "running"] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("result", [None, (GOOD, "text", "done")])
+def test_what_can_never_be_an_outcome_ends_the_study(store, result):
+    with open_study(store) as study, pytest.raises(SetUpError, match=r"TypeError|AttributeError"):
+        study.run(lambda *_: result, 2)
+
+
+def test_the_same_failure_from_the_first_trial_on_ends_the_study(store):
+    with open_study(store) as study:
+        with pytest.raises(StudyError, match=r"each of the first 3 trials failed for the same reason.*the pump is dry"):
+            study.run(lambda *_: (None, None, "the pump is dry"), 9)
+        assert [t.status for t in study.trials()] == ["failed"] * SAME_FAILURES
+        # Asked again it goes on: somebody may know better.
+        study.run(Toy(), 5)
+        assert len(study.trials()) == 5
+
+
+def test_trials_that_ended_at_a_limit_or_for_different_reasons_do_not(store):
+    reasons = iter(["a", "b", "b", "b"])
+    with open_study(store) as study:
+        study.run(lambda *_: (None, None, next(reasons)), 4)
+    with open_study(store, "limits") as study:
+        study.run(lambda *_: (None, None, "limit trip: level above 1"), 4)
+        assert len(study.trials()) == 4

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.checks.finding import Evidence, Finding
-from chargetune.control.control_step import problem_of
+from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller
 from chargetune.model.parameter_space import ParameterSpace
 
@@ -22,15 +22,18 @@ BASES, TRIED = 2, 32
 HOPELESS = 0.5
 
 
-def check_influence(inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]], controller: Controller) -> list[Finding]:
+def check_influence(
+    inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]], controller: Controller, given: NDArray[np.float64] | None = None
+) -> list[Finding]:
     """Entries of theta that do not change what the controller does.
 
     ``inputs(theta)`` runs a closed loop and gives its inputs (K, nu). Each entry is put to both of its bounds, alone, from
-    theta_0 and from random theta; its influence is the largest change of any input as a share of its range.
+    theta_0 and from random theta; its influence is the largest change of any input as a share of its range, with the given
+    signals at ``given`` (by default 0).
     """
     space, draw = controller.theta, np.random.default_rng(0)
     bases = [space.to_unit(space.default), *(draw.uniform(size=space.dimension) for _ in range(BASES))]
-    ranges, influence = _ranges(controller), np.zeros(space.dimension)
+    ranges, influence = _ranges(controller, given), np.zeros(space.dimension)
     for base in bases:
         reference = inputs(space.from_unit(base))
         for i in range(space.dimension):
@@ -116,8 +119,10 @@ def check_theta(worst: Callable[[NDArray[np.float64]], float], space: ParameterS
     ]
 
 
-def _ranges(controller: Controller) -> NDArray[np.float64]:
+def _ranges(controller: Controller, given: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     problem, nu = problem_of(controller), len(controller.model.inputs)
-    q = problem.prepare(controller.theta.default, controller.setpoint, controller.model.nominal)
-    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(np.array(controller.start), q))
+    signals = np.zeros(len(controller.given)) if given is None else given
+    q = numbers(controller, controller.theta.default, np.tile(signals, controller.horizon + 2))
+    # The last ones: a bound of the rate narrows the first.
+    lower, upper = (np.array(bound).ravel()[-nu:] for bound in problem.bounds(problem.first(controller.start, controller.input_before), q))
     return np.asarray(np.maximum(upper - lower, 1e-9), dtype=np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.checks.finding import Evidence, Finding
-from chargetune.control.control_step import problem_of
+from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller, LimitRows
 from chargetune.model.model import Model
 
@@ -26,10 +26,11 @@ INTEGRATES, OVER = 1e-6, 3.0
 POINTS = 40
 
 
-def model_at(controller: Controller, theta: ArrayLike | None = None) -> Model:
-    """The controller's model with the parameters it has at theta (None: untuned)."""
+def model_at(controller: Controller, theta: ArrayLike | None = None, given: ArrayLike | None = None) -> Model:
+    """The controller's model with the parameters it has at theta (None: untuned) and at values of its given signals (None: 0)."""
     model = controller.model
-    values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal)).ravel()
+    signals = np.zeros(len(controller.given)) if given is None else np.asarray(given, dtype=np.float64)
+    values = np.array(controller.parameters(controller.theta_vector(theta), model.nominal, signals)).ravel()
     named, first = {}, 0
     for name, size in model.parameter_blocks.items():
         named[name] = values[first : first + size]
@@ -44,15 +45,25 @@ def row_values(
     u: NDArray[np.float64],
     theta: ArrayLike | None = None,
     now: NDArray[np.float64] | None = None,
+    *,
+    last: NDArray[np.float64] | None = None,
+    given: NDArray[np.float64] | None = None,
+    bounds: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """The largest row of a limit (positive: beyond it, in its unit) at states (K, nx) and inputs (K, nu), shape (K,).
 
-    ``now`` (K, nx) are the states at which the controller solved, by default x.
+    ``now`` (K, nx) are the states at which the controller solved, by default x; ``last`` (K, nu) the inputs before, by default that
+    before the first interval; ``given`` (K, signals) the given signals of the intervals, by default 0, ``bounds`` those that the
+    limits read, by default the same.
     """
     values, count = controller.theta_vector(theta), len(x)
-    p = controller.parameters(values, controller.model.nominal)
-    fixed = (ca.repmat(ca.DM(values), 1, count), ca.repmat(p, 1, count))
-    rows = controller.limits[limit].rows.map(count)(x.T, u.T, *fixed, (x if now is None else now).T)
+    signals = np.zeros((count, len(controller.given))) if given is None else given
+    before = np.tile(controller.input_before, (count, 1)) if last is None else last
+    p = controller.parameters.map(count)(
+        ca.repmat(ca.DM(values), 1, count), ca.repmat(ca.DM(controller.model.nominal), 1, count), signals.T
+    )
+    fixed = (ca.repmat(ca.DM(values), 1, count), p, (x if now is None else now).T)
+    rows = controller.limits[limit].rows.map(count)(x.T, u.T, *fixed, before.T, (signals if bounds is None else bounds).T)
     return np.asarray(np.max(np.array(rows), axis=0), dtype=np.float64)
 
 
@@ -67,13 +78,14 @@ def check_signs(
     states: NDArray[np.float64],
     inputs: NDArray[np.float64],
     theta: ArrayLike | None = None,
+    given: ArrayLike | None = None,
 ) -> tuple[Finding, ...]:
     """Outputs of the model that react to an input in the wrong direction.
 
     ``expected`` maps (output, input) to +1 or -1, the sign of d h(f(x, u), u) / du; ``states`` (K, nx) and ``inputs``
-    (K, nu) are where it is looked at.
+    (K, nu) are where it is looked at, with the given signals at ``given`` (by default 0).
     """
-    model = model_at(controller, theta)
+    model = model_at(controller, theta, given)
     x, u, p = (ca.SX.sym(n, k) for n, k in (("x", len(model.states)), ("u", len(model.inputs)), ("p", model.nominal.size)))
     slope = ca.Function("slope", [x, u, p], [ca.jacobian(model.h(model.f(x, u, p), u, p), u)])
     points = _points(len(inputs))
@@ -98,13 +110,15 @@ def check_signs(
     return tuple(out)
 
 
-def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple[Finding, ...]:
-    """Limits that every admissible input breaks at the start state."""
+def check_start(controller: Controller, theta: ArrayLike | None = None, given: NDArray[np.float64] | None = None) -> tuple[Finding, ...]:
+    """Limits that every admissible input breaks at the start state; ``given`` are the given signals then, by default 0."""
+    signals = np.zeros(len(controller.given)) if given is None else given
     values = controller.theta_vector(theta)
     problem, nu = problem_of(controller), len(controller.model.inputs)
     start = np.array(controller.start)
-    q = problem.prepare(values, controller.setpoint, controller.model.nominal)
-    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(start, q))
+    now = problem.first(start, controller.input_before)
+    q = numbers(controller, values, np.tile(signals, controller.horizon + 2))
+    lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(now, q))
     each = [sorted({low, high, float(np.clip(0.0, low, high))}) for low, high in zip(lower, upper, strict=True)]
     choices = np.array(list(itertools.product(*each)))
     out = []
@@ -112,7 +126,7 @@ def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple
         if limit.at == "terminal":
             continue
         # A state's row at the start is given, whatever `at` says; an output's depends on the input.
-        excess = row_values(controller, j, np.tile(start, (len(choices), 1)), choices, values)
+        excess = row_values(controller, j, np.tile(start, (len(choices), 1)), choices, values, given=np.tile(signals, (len(choices), 1)))
         least = float(np.min(excess))
         if least > noticeable(limit):
             out.append(
@@ -129,14 +143,18 @@ def check_start(controller: Controller, theta: ArrayLike | None = None) -> tuple
 
 
 def check_horizon(
-    controller: Controller, states: NDArray[np.float64], inputs: NDArray[np.float64], theta: ArrayLike | None = None
+    controller: Controller,
+    states: NDArray[np.float64],
+    inputs: NDArray[np.float64],
+    theta: ArrayLike | None = None,
+    given: ArrayLike | None = None,
 ) -> tuple[Finding, ...]:
     """A horizon so short that the model's dynamics cannot matter.
 
     The time constants are Ts / |ln lambda| for the eigenvalues lambda of df/dx that neither integrate (1) nor
     are over within an interval (near 0); the fastest of them, in the median over the points, has to be seen.
     """
-    model = model_at(controller, theta)
+    model = model_at(controller, theta, given)
     x, u, p = (ca.SX.sym(n, k) for n, k in (("x", len(model.states)), ("u", len(model.inputs)), ("p", model.nominal.size)))
     transition = ca.Function("A", [x, u, p], [ca.jacobian(model.f(x, u, p), x)])
     step, points, fastest = model.sampling_time_s, _points(len(inputs)), []

@@ -328,6 +328,10 @@ def store_migrate(store: StoreArgument) -> None:
     migrate_command(store)
 
 
+# What --debug said, for who reports an error after the command has ended.
+_debug: list[bool] = []
+
+
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
     if value:
         typer.echo(f"chargetune {__version__}")
@@ -336,9 +340,10 @@ def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the opt
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: ARG001
+    debug: Annotated[bool, typer.Option("--debug", help="With an error show where in the program it came from.")] = False,
 ) -> None:
-    pass
+    _debug.append(debug)
 
 
 def main() -> None:
@@ -363,11 +368,12 @@ def main() -> None:
         # Import only now: these modules are heavy, and are loaded already when one of them raised.
         from pydantic import ValidationError
 
+        from chargetune.plants.plant import SetUpError
         from chargetune.study.identity import StudyError
         from chargetune.study.runner import WorkerError
         from chargetune.study.store.rows import StoreError
 
-        if isinstance(error, (ValidationError, StudyError, StoreError, WorkerError)):
+        if isinstance(error, (ValidationError, SetUpError, StudyError, StoreError, WorkerError)):
             _refuse(error)
         traceback.print_exc()
         what = f"{type(error).__name__}: {error}"
@@ -376,6 +382,8 @@ def main() -> None:
 
 
 def _refuse(error: BaseException) -> NoReturn:
+    if any(_debug):
+        typer.echo(getattr(error, "details", "") or "".join(traceback.format_exception(error)), err=True)
     text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
     typer.echo(f"chargetune: {text}", err=True)
     sys.exit(2)

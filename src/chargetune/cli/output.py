@@ -30,6 +30,9 @@ ROWS = (
     ("solver_failures", "control steps not solved to tolerance", ""),
 )
 
+# Of these figures those that a study has.
+COLUMNS = (("overshoot_mV", "overshoot mV"), ("t80_min", "t80 min"), ("t95_min", "t95 min"), ("unsolved_percent", "unsolved %"))
+
 
 def console(*, stderr: bool = False) -> Console:
     """Where text for a person goes."""
@@ -70,6 +73,10 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) 
     table.add_column("")
     for key, label, unit in ROWS:
         table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
+    drawn = {name: s.metrics for name, s in scores.items() if s and "plants" in s.metrics}
+    if drawn:
+        counts = (f"{m['violating_plants']:.0f} of {m['plants']:.0f}" if (m := drawn.get(name)) else "-" for name in scores)
+        table.add_row("drawn plants over a limit; the figures above are their means, over a limit their worst", *counts, "")
     verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
     table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
     return table
@@ -83,18 +90,18 @@ def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[floa
 
 
 def trials_table(trials: Sequence[Trial]) -> Table:
-    """One row a trial."""
+    """One row a trial, with the share of its control steps that were not solved."""
+    told = {name for t in trials if t.score for name in t.score.metrics}
+    figures = [(name, label) for name, label in COLUMNS if name in told]
     table = Table(box=None, pad_edge=False)
-    for heading in ("trial", "status", "overshoot mV", "t80 min", "t95 min", "G", "limits", "ending"):
+    for heading in ("trial", "status", *(label for _, label in figures), "G", "limits", "ending"):
         table.add_column(heading, justify="left" if heading in ("status", "limits", "ending") else "right")
     for t in trials:
         s = t.score
         table.add_row(
             str(t.number),
             t.status.value,
-            number(s.metrics.get("overshoot_mV")) if s else "-",
-            number(s.metrics.get("t80_min")) if s else "-",
-            number(s.metrics.get("t95_min")) if s else "-",
+            *(number(s.metrics.get(name)) if s else "-" for name, _ in figures),
             f"{s.performance:.4g}" if s else "-",
             ("kept" if s.feasible else "[red]broken[/]") if s else "-",
             t.ending or "",

@@ -17,10 +17,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from chargetune.battery.charging.checks import check_charging
-from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.verdict import charge_time, violation_mVs
-from chargetune.battery.studies.open_study import open_study
+from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
@@ -85,7 +84,7 @@ def tune_command(
         write_whole(out / "summary.json", json.dumps(summary, indent=1))
     if as_json:
         print(json.dumps(summary))  # noqa: T201
-        _end(safety)
+        _end(safety, everything)
         return
     _closing(problem, everything, result)
     if safety:
@@ -93,7 +92,7 @@ def tune_command(
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
     console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
-    _end(safety)
+    _end(safety, everything)
 
 
 @dataclass(frozen=True)
@@ -139,9 +138,9 @@ def _run(
         try:
             # Without batches more workers have something to do only if the order of the trials is given up for them; and
             # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner == "iterative_learning"
+            alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
             ahead = workers if workers > 1 and not alone else None
-            study.run(Evaluation(problem), count, executor=executor, workers=ahead, progress=note)
+            study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
         everything = study.trials()[:count]
@@ -161,7 +160,10 @@ def _said(screen: Console) -> Iterator[None]:
         yield
 
 
-def _end(safety: dict[str, Any] | None) -> None:
+def _end(safety: dict[str, Any] | None, trials: Sequence[Trial] = ()) -> None:
+    """A last line and an exit code that say so where nothing can have come of it."""
+    if trials and all(t.score is None for t in trials):
+        raise ValueError(f"no trial has a score; the last one ended with: {trials[-1].ending}")
     if safety and safety["stopped"]:
         raise ValueError(f"stopped before the last trial: {safety['stopped']}")
 
@@ -206,12 +208,13 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     # A safe study does not begin with the untuned controller.
     label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"
     screen.print(metrics_table({label: first, "tuned": best.score if best else None}, problem))
-    if best is None or not best.feasible:
+    if best is None:
+        return
+    if not best.feasible:
         screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
-    if best is not None:
-        units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
-        screen.print(result_line(result), soft_wrap=True)
-        screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
+    units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
+    screen.print(result_line(result), soft_wrap=True)
+    screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 
 def _summary(config: Config, trials: list[Trial], result: StudyResult, names: tuple[str, ...]) -> dict[str, Any]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -14,88 +13,20 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.control.convexity import Curvature, curvature_of
 from chargetune.control.estimators import Estimator, ExactState
-from chargetune.model.model import Model, Named
+from chargetune.control.limits import Bound, LimitRows, SoftLimit
+from chargetune.control.stage import Expression, Stage, Symbols
+from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import ParameterSpace
-from chargetune.runtime.split import split
+from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Controller", "LimitRows", "SoftLimit", "Stage"]
 
 HORIZON_MAX = 50
-CONVEXITY_POINTS = 8
-At = Literal["start", "end", "both", "terminal"]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What an expression of the control problem may use, each read by name, as CasADi symbols.
-
-    x, u, y, p: predicted state, input, output h(x, u, p) and model parameters; theta: the tuned parameters;
-    now: the estimated state at the moment of the solve; x_d, u_d: the set-point.
-    """
-
-    x: Named
-    u: Named
-    y: Named
-    p: Named
-    theta: Named
-    now: Named
-    x_d: Named
-    u_d: Named
-
-
-Expression = Callable[[Stage], Any]
-Bound = float | Expression
-
-
-@dataclass(frozen=True)
-class SoftLimit:
-    """A limit on an output or a state, kept by an exact penalty; either side is a number or an expression of theta.
-
-    of
-        Name of an output or state of the controller's model.
-    at
-        Where in the interval outputs are limited: h(x_i, u_i), h(x_{i+1}, u_i), both, or only at the end of the horizon.
-        A state is limited at ``end`` or ``terminal``, since x_0 is given.
-    penalty
-        Cost per unit of the largest violation over the horizon, weighted 1 at its start to 2 at its end. The penalty is
-        exact (no violation where none is needed) when it exceeds the sum of the limit's multipliers.
-    scale
-        A noticeable violation, in the unit of the limit; the solver's tolerance is relative to it.
-    """
-
-    of: str
-    lower: Bound | None = None
-    upper: Bound | None = None
-    at: At = "both"
-    penalty: float = 1e3
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.lower is None and self.upper is None:
-            raise ValueError(f"limit of {self.of}: neither lower nor upper is given")
-        for name in ("lower", "upper"):
-            value = getattr(self, name)
-            if value is not None and not callable(value) and not _finite(value):
-                raise ValueError(f"limit of {self.of}: {name} = {value!r}, allowed is a finite number or an expression")
-        if _finite(self.lower) and _finite(self.upper) and self.lower >= self.upper:  # type: ignore[operator]
-            raise ValueError(f"limit of {self.of}: lower = {self.lower} must be less than upper = {self.upper}")
-        if self.at not in ("start", "end", "both", "terminal"):
-            raise ValueError(f"limit of {self.of}: at = {self.at!r}, allowed is start, end, both or terminal")
-        for name in ("penalty", "scale"):
-            if not _finite(getattr(self, name)) or getattr(self, name) <= 0:
-                raise ValueError(f"limit of {self.of}: {name} = {getattr(self, name)!r}, allowed is a finite number > 0")
-
-
-@dataclass(frozen=True)
-class LimitRows:
-    """A `SoftLimit` as a CasADi function (x, u, theta, p, now) -> rows that are <= 0 when it is kept."""
-
-    of: str
-    rows: ca.Function
-    at: At
-    penalty: float
-    scale: float
+Hessian = Literal["gauss_newton", "exact"]
+Solver = Literal["sqp", "ipopt"]
+FirstGuess = Literal["cold", "ipopt"]
 
 
 @dataclass(frozen=True)
@@ -105,10 +36,22 @@ class Controller:
         min  sum_{i<N} l(x_i, u_i) + Vf(x_N) + sum of penalties
         s.t. x_{i+1} = f(x_i, u_i), x_0 = estimate, input_lower <= u_i <= input_upper, limits on outputs and states
 
-    Inputs are bounded hard, everything else softly, so the problem always has a solution. l and Vf are to be convex
-    in (x, u) and x (their Hessians are the curvature of the Gauss-Newton model). Build one with `Controller.build`.
-    ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement, ``fallback`` the input
-    applied when the solver fails, both within the input bounds by clipping.
+    Inputs are bounded hard, everything else softly, so the problem always has a solution. Build one with `Controller.build`.
+    ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement,
+    ``input_before`` the input before the first interval, ``fallback`` the input applied when the solver fails, within the
+    input bounds by clipping. ``given`` are signals whose values over the horizon are told at run time (`model.given`).
+
+    ``input_rate`` (inf: none) bounds the change of an input from one interval to the next, hard like the bounds:
+
+        min(u_{i-1} - rate, upper_i) <= u_i <= max(u_{i-1} + rate, lower_i)
+
+    so that where bounds leave no input within the rate the bounds win.
+
+    ``hessian``: with "gauss_newton" the costs' Hessians are the curvature of the problem; they have to be convex in the inputs and
+    the states that these reach. With "exact" it is the Lagrangian's, made convex where it is not: for costs that are bent downwards, or
+    linear in the states (economic ones) of a nonlinear model. `build` chooses by `curvatures`. Of a problem that is not convex the
+    solver finds a local solution: the one downhill of its ``first_guess``, which is the input before, repeated, or the plan that
+    IPOPT finds from ``start``. ``solver`` = "ipopt" leaves every solve to IPOPT, step by step only.
     """
 
     model: Model
@@ -121,10 +64,17 @@ class Controller:
     input_lower: ca.Function
     input_upper: ca.Function
     fallback: ca.Function
+    input_rate: ca.Function
+    rated: tuple[int, ...]
     setpoint: tuple[float, ...]
     start: tuple[float, ...]
+    input_before: tuple[float, ...]
+    given: tuple[Signal, ...] = ()
     estimator: Estimator = field(default_factory=ExactState)
     iterations_max: int = 20
+    hessian: Hessian = "gauss_newton"
+    solver: Solver = "sqp"
+    first_guess: FirstGuess = "cold"
 
     @classmethod
     def build(
@@ -142,35 +92,55 @@ class Controller:
         fallback: Mapping[str, Bound] | None = None,
         setpoint: Mapping[str, float] | None = None,
         start: Mapping[str, float] | None = None,
+        given: Sequence[Signal] = (),
+        input_rate: Mapping[str, Bound] | None = None,
+        input_before: Mapping[str, float] | None = None,
         estimator: Estimator | None = None,
         iterations_max: int = 20,
+        hessian: Hessian | None = None,
+        solver: Solver = "sqp",
+        first_guess: FirstGuess = "cold",
     ) -> Controller:
         """Make a controller from Python functions of a `Stage`.
 
-        ``parameters`` returns the model parameters that theta changes, by name; the others keep the model's values.
-        ``fallback`` defaults to the lower input bounds. Raises ValueError naming the field at fault.
+        ``parameters`` returns the model parameters that theta or a given signal changes, by name; the others keep the
+        model's values. ``fallback`` defaults to the lower input bounds. Bounds of inputs and of their rate are numbers or
+        expressions of theta, p, now and given. Raises ValueError naming the field at fault.
         """
-        if isinstance(horizon, bool) or not isinstance(horizon, int) or not 1 <= horizon <= HORIZON_MAX:
+        if not is_integer(horizon) or not 1 <= horizon <= HORIZON_MAX:
             raise ValueError(f"controller: horizon = {horizon!r}, allowed is an integer in [1, {HORIZON_MAX}]")
-        if isinstance(iterations_max, bool) or not isinstance(iterations_max, int) or iterations_max < 1:
+        choices = (
+            ("hessian", hessian, (None, "gauss_newton", "exact")),
+            ("solver", solver, ("sqp", "ipopt")),
+            ("first_guess", first_guess, ("cold", "ipopt")),
+        )
+        for label, value, allowed in choices:
+            if value not in allowed:
+                raise ValueError(f"controller: {label} = {value!r}, allowed is {', '.join(map(str, allowed))}")
+        if not is_integer(iterations_max) or iterations_max < 1:
             raise ValueError(f"controller: iterations_max = {iterations_max!r}, allowed is an integer >= 1")
+        named = [signal.name for signal in given]
+        if len(set(named)) < len(named):
+            raise ValueError(f"controller: given = {named}, allowed are different names")
         wanted = _named_values("setpoint", setpoint or {}, (*model.state_names, *model.input_names))
         begin = _named_values("start", start or {}, model.state_names)
-        symbols = _Symbols(model, theta, wanted, begin)
-        for label, given in (("input_lower", input_lower), ("input_upper", input_upper)):
-            if set(given) != set(model.input_names):
-                raise ValueError(f"controller: {label} names {sorted(given)}, expected {list(model.input_names)}")
+        before = _named_values("input_before", input_before or {}, model.input_names)
+        symbols = Symbols(model, theta, given)
+        for label, bounds in (("input_lower", input_lower), ("input_upper", input_upper)):
+            if set(bounds) != set(model.input_names):
+                raise ValueError(f"controller: {label} names {sorted(bounds)}, expected {list(model.input_names)}")
         for name in model.input_names:
             low, high = input_lower[name], input_upper[name]
-            if _finite(low) and _finite(high) and low >= high:  # type: ignore[operator]
+            if is_finite(low) and is_finite(high) and low >= high:  # type: ignore[operator]
                 raise ValueError(f"controller: input_lower of {name} = {low} must be less than input_upper = {high}")
         declared = dict(fallback) if fallback is not None else dict(input_lower)
         if set(declared) != set(model.input_names):
             raise ValueError(f"controller: fallback names {sorted(declared)}, expected {list(model.input_names)}")
-        return cls(
+        rate = _rates(input_rate or {}, model.input_names)
+        built = cls(
             model=model,
             theta=theta,
-            horizon=horizon,
+            horizon=int(horizon),
             parameters=symbols.parameters(parameters),
             stage_cost=symbols.cost("stage_cost", stage_cost, with_input=True),
             terminal_cost=symbols.cost("terminal_cost", terminal_cost, with_input=False),
@@ -178,11 +148,54 @@ class Controller:
             input_lower=symbols.inputs("input_lower", input_lower),
             input_upper=symbols.inputs("input_upper", input_upper),
             fallback=symbols.inputs("fallback", declared),
+            input_rate=symbols.inputs("input_rate", rate, np.inf),
+            rated=tuple(i for i, name in enumerate(model.input_names) if name in rate),
             setpoint=wanted,
             start=begin,
+            input_before=before,
+            given=tuple(given),
             estimator=estimator or ExactState(),
-            iterations_max=iterations_max,
+            iterations_max=int(iterations_max),
+            solver=solver,
+            first_guess=first_guess,
         )
+        return replace(built, hessian=hessian or built._suitable_hessian)
+
+    @cached_property
+    def curvatures(self) -> dict[str, Curvature]:
+        """The least and the largest curvature that was found of the costs."""
+        arguments = (self.model, self.theta, self.setpoint, self.start)
+        costs = {"stage_cost": self.stage_cost, "terminal_cost": self.terminal_cost}
+        return {label: curvature_of(cost, *arguments) for label, cost in costs.items()}
+
+    @property
+    def _suitable_hessian(self) -> Hessian:
+        found = self.curvatures.values()
+        if not all(one.convex for one in found):
+            return "exact"
+        # The costs' own Hessian is all there is where states have a part in it, or where nothing else is bent.
+        return "gauss_newton" if any(one.of_states for one in found) or self._linear else "exact"
+
+    @property
+    def _linear(self) -> bool:
+        """Whether dynamics and limits are linear in (x, u)."""
+        x, u, p = self.model.f.sx_in()
+        bent = [self.model.f(x, u, p)]
+        for limit in self.limits:
+            arguments = limit.rows.sx_in()
+            bent.append(limit.rows(x, u, *arguments[2:]))
+        return all(ca.is_linear(e, ca.vertcat(x, u)) for e in bent)
+
+    @property
+    def given_names(self) -> tuple[str, ...]:
+        return tuple(signal.name for signal in self.given)
+
+    @cached_property
+    def carried(self) -> tuple[int, ...]:
+        """Indices of the inputs whose last value is a part of the problem's state: of a bounded rate, or read as ``u_last``."""
+        read = [cost.jac_sparsity(0, 6) for cost in (self.stage_cost, self.terminal_cost)]
+        read += [limit.rows.jac_sparsity(0, 5) for limit in self.limits]
+        return tuple(sorted({*self.rated, *(column for pattern in read for column in pattern.get_col())}))
 
     @cached_property
     def estimation(self) -> ca.Function:
@@ -206,11 +219,20 @@ class Controller:
         """A hash of everything that is compiled in; numbers that are run-time values do not enter."""
         functions = [
             self.estimation, self.model.f, self.model.h, self.parameters, self.stage_cost, self.terminal_cost,
-            self.input_lower, self.input_upper, self.fallback, *(limit.rows for limit in self.limits),
+            self.input_lower, self.input_upper, self.fallback, self.input_rate, *(limit.rows for limit in self.limits),
         ]  # fmt: skip
         limits = [(limit.of, limit.at, limit.penalty, limit.scale) for limit in self.limits]
         names = [self.model.state_names, self.model.input_names, self.model.output_names, self.model.sampling_time_s]
-        sizes = [self.theta.dimension, self.horizon, self.iterations_max, *names, self.model.parameter_blocks]
+        sizes = [
+            self.theta.dimension,
+            self.horizon,
+            self.iterations_max,
+            *names,
+            self.model.parameter_blocks,
+            self.rated,
+            self.given_names,
+            self.hessian,
+        ]
         content = pickle.dumps(([f.serialize() for f in functions], limits, sizes))
         return hashlib.sha256(content).hexdigest()
 
@@ -219,127 +241,21 @@ class Controller:
         return self.theta.default if theta is None else self.theta.validate(theta)
 
 
-class _Symbols:
-    """One set of symbols, so that all functions of a controller have the same arguments."""
-
-    def __init__(self, model: Model, theta: ParameterSpace, wanted: tuple[float, ...], begin: tuple[float, ...]) -> None:
-        self.model, self.space, self.wanted, self.begin = model, theta, np.array(wanted), np.array(begin)
-        sizes = {p.name: p.size for p in theta.parameters}
-        nx, nu, np_ = len(model.states), len(model.inputs), sum(model.parameter_blocks.values())
-        self.x, self.u, self.p = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("p", np_)
-        self.theta, self.now = ca.SX.sym("theta", theta.dimension), ca.SX.sym("now", nx)
-        self.setpoint = ca.SX.sym("setpoint", nx + nu)
-        wanted_x, wanted_u = split(self.setpoint, (nx, nu))
-        states, inputs = dict.fromkeys(model.state_names, 1), dict.fromkeys(model.input_names, 1)
-        outputs = dict.fromkeys(model.output_names, 1)
-        self.stage = Stage(
-            x=Named(states, self.x),
-            u=Named(inputs, self.u),
-            y=Named(outputs, model.h(self.x, self.u, self.p)),
-            p=Named(model.parameter_blocks, self.p),
-            theta=Named(sizes, self.theta),
-            now=Named(states, self.now),
-            x_d=Named(states, wanted_x),
-            u_d=Named(inputs, wanted_u),
-        )
-
-    def parameters(self, expression: Callable[[Stage], Mapping[str, Any]]) -> ca.Function:
-        changed = expression(self.stage)
-        blocks = self.model.parameter_blocks
-        unknown = sorted(set(changed) - set(blocks))
-        if unknown:
-            raise ValueError(f"controller: parameters sets unknown {unknown}, allowed are {', '.join(blocks)}")
-        rows = []
-        for name, size in blocks.items():
-            value = ca.SX(changed.get(name, self.stage.p[name]))
-            if value.shape != (size, 1):
-                raise ValueError(f"controller: parameters sets {name} with shape {value.shape}, expected ({size}, 1)")
-            rows.append(value)
-        return self._function("parameters", [self.theta, self.p], ca.vertcat(*rows) if rows else ca.SX(0, 1))
-
-    def cost(self, label: str, expression: Expression, *, with_input: bool) -> ca.Function:
-        value = ca.SX(expression(self.stage))
-        if value.shape != (1, 1):
-            raise ValueError(f"controller: {label} has shape {value.shape}, expected a scalar")
-        if not with_input and ca.depends_on(value, self.u):
-            raise ValueError(f"controller: {label} depends on the input, allowed are x, theta, p, now and the set-point")
-        function = self._function(label, [self.x, self.u, self.theta, self.p, self.setpoint, self.now], value)
-        self._check_convex(label, value)
-        return function
-
-    def _check_convex(self, label: str, value: Any) -> None:
-        """Look at the curvature in (x, u) at start, set-point and random points: the QP must be bounded below."""
-        curvature, _ = ca.hessian(value, ca.vertcat(self.x, self.u))
-        evaluate = ca.Function("curvature", [self.x, self.u, self.theta, self.p, self.setpoint, self.now], [curvature])
-        draw = np.random.default_rng(0)
-        default, nx, size = self.space.default, self.begin.size, self.wanted.size
-        places = [(np.pad(self.begin, (0, size - nx)), default, self.begin), (self.wanted, default, self.wanted[:nx])]
-        for _ in range(CONVEXITY_POINTS):
-            theta = draw.uniform(self.space.lower, self.space.upper) if default.size else default
-            places.append((draw.uniform(-1.0, 1.0, size), theta, draw.uniform(-1.0, 1.0, nx)))
-        for xu, theta, now in places:
-            matrix = np.array(evaluate(xu[:nx], xu[nx:], theta, self.model.nominal, self.wanted, now))
-            if not np.all(np.isfinite(matrix)):
-                continue
-            values = np.linalg.eigvalsh(matrix)
-            if values[0] < -1e-9 * (1.0 + abs(values[-1])):
-                raise ValueError(
-                    f"controller: {label} has curvature {values[0]:.3g} in (x, u), allowed is a convex function (curvature >= 0)"
-                )
-
-    def limit(self, limit: SoftLimit) -> LimitRows:
-        model, s = self.model, self.stage
-        if limit.of in model.output_names and not (limit.of in model.state_names and limit.at == "terminal"):
-            value = s.y[limit.of]
-        elif limit.of in model.state_names:
-            value = s.x[limit.of]
-        else:
-            raise ValueError(f"limit of {limit.of!r}: unknown name, allowed are {', '.join((*model.output_names, *model.state_names))}")
-        if limit.at == "terminal" and ca.depends_on(value, self.u):
-            raise ValueError(f"limit of {limit.of}: at = 'terminal' needs a value without direct feedthrough of the input")
-        rows = []
-        for bound, sign in ((limit.upper, 1.0), (limit.lower, -1.0)):
-            if bound is not None:
-                rows.append(sign * (value - (bound(s) if callable(bound) else bound)))
-        at = limit.at
-        if at in ("start", "both") and not ca.depends_on(ca.vertcat(*rows), self.u):
-            # Without the input in it the value at the start of an interval is the value at the end of the one before,
-            # and the first one is given: only the end can be controlled.
-            at = "end"
-        return LimitRows(
-            limit.of, self._function(f"limit_{limit.of}", self.row_arguments, ca.vertcat(*rows)), at, limit.penalty, limit.scale
-        )
-
-    @property
-    def row_arguments(self) -> list[ca.SX]:
-        return [self.x, self.u, self.theta, self.p, self.now]
-
-    def inputs(self, label: str, bounds: Mapping[str, Bound]) -> ca.Function:
-        values = []
-        for name in self.model.input_names:
-            bound = bounds[name]
-            value = bound(self.stage) if callable(bound) else bound
-            if not callable(bound) and not _finite(bound):
-                raise ValueError(f"controller: {label} of {name} = {bound!r}, allowed is a finite number or an expression")
-            values.append(value)
-        return self._function(label, [self.theta, self.p, self.now], ca.vertcat(*(ca.SX(v) for v in values)))
-
-    def _function(self, label: str, arguments: list[ca.SX], value: ca.SX) -> ca.Function:
-        try:
-            return ca.Function(label, arguments, [ca.cse(value)])
-        except RuntimeError as error:
-            raise ValueError(f"controller: {label} uses a quantity that is not known there ({error})") from error
-
-
 def _named_values(label: str, given: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
     unknown = sorted(set(given) - set(names))
     if unknown:
         raise ValueError(f"controller: {label} names unknown {unknown}, allowed are {', '.join(names)}")
     for name, value in given.items():
-        if not _finite(value):
+        if not is_finite(value):
             raise ValueError(f"controller: {label} of {name} = {value!r}, allowed is a finite number")
     return tuple(float(given.get(name, 0.0)) for name in names)
 
 
-def _finite(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+def _rates(rate: Mapping[str, Bound], names: Sequence[str]) -> dict[str, Bound]:
+    unknown = sorted(set(rate) - set(names))
+    if unknown:
+        raise ValueError(f"controller: input_rate names unknown {unknown}, allowed are {', '.join(names)}")
+    for name, value in rate.items():
+        if not callable(value) and not (is_finite(value) and value > 0):
+            raise ValueError(f"controller: input_rate of {name} = {value!r}, allowed is a finite number > 0 or an expression")
+    return dict(rate)

@@ -2,7 +2,8 @@
 
 Direct multiple shooting with the states as variables and the model as equality constraints, slacks as variables, exact
 Hessians. It shares the controller's own functions with `ocp` and nothing else: no condensing, no scaling, no
-linearisation. Some hundred times slower; for tests, and on request: ``run_episode(..., act=ipopt_act)``.
+linearisation. Some hundred times slower; for tests, and on request: ``Controller.build(..., solver="ipopt")``, or as
+``first_guess="ipopt"``.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.control.control_step import Info, Memory, problem_of
+from chargetune.control.control_step import Info, Memory, numbers, problem_of
 from chargetune.control.controller import Controller
 from chargetune.control.ocp import row_weight
 from chargetune.control.sqp import SolveStatus
 from chargetune.runtime.cache import cached
+from chargetune.runtime.split import split
 
-__all__ = ["Nlp", "ipopt_act", "multiple_shooting"]
+__all__ = ["Nlp", "ipopt_act", "ipopt_plan", "multiple_shooting"]
 
 # At 1e-9 IPOPT stops 2 mA early where a charge is nearly done and the cost is flat.
 OPTIONS: dict[str, Any] = {
@@ -32,106 +34,139 @@ OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Nlp:
-    """The problem for IPOPT: variables (u_0 .. u_{N-1}, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal)."""
+    """The problem for IPOPT: variables (u_0 .. u_{N-1}, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal, u_last, given).
+
+    bounds: (theta, p_nominal, now, u_last, given) -> (lower, upper) over the horizon, shapes (N nu,).
+    """
 
     solver: ca.Function
     equalities: int
     inequalities: int
     bounds: ca.Function
-    fallback: ca.Function
 
 
 def multiple_shooting(controller: Controller) -> Nlp:
     """min J + sum_j w_j (s_j + s_j^2 / (2 scale_j)) s.t. x_{i+1} = f(x_i, u_i), (1 + i / N) rows <= s, bounds on u, s >= 0."""
     model, horizon = controller.model, controller.horizon
-    nx, nu = len(model.states), len(model.inputs)
+    nx, nu, ng = len(model.states), len(model.inputs), len(controller.given)
     now, theta = ca.MX.sym("now", nx), ca.MX.sym("theta", controller.theta.dimension)
     setpoint, nominal = ca.MX.sym("setpoint", nx + nu), ca.MX.sym("p", model.nominal.size)
-    p = controller.parameters(theta, nominal)
+    last, given = ca.MX.sym("u_last", nu), ca.MX.sym("given", ng * (horizon + 2))
+    _, *signals = split(given, [ng] * (horizon + 2))
     inputs, states = ca.MX.sym("U", nu, horizon), ca.MX.sym("X", nx, horizon)
     slack = ca.MX.sym("s", len(controller.limits))
     cost: Any = ca.MX(0.0)
     gaps: list[Any] = []
     rows: list[Any] = []
+    bounds: list[Any] = []
 
-    def add_rows(places: tuple[str, ...], stage: int, x: Any, u: Any) -> None:
+    def add_rows(places: tuple[str, ...], stage: int, *arguments: Any) -> None:
         weight = row_weight(stage, horizon)
-        rows.extend(weight * limit.rows(x, u, theta, p, now) - slack[j] for j, limit in enumerate(controller.limits) if limit.at in places)
+        rows.extend(weight * limit.rows(*arguments) - slack[j] for j, limit in enumerate(controller.limits) if limit.at in places)
 
-    x: Any = now
+    x, before = now, last
     for i in range(horizon):
-        u = inputs[:, i]
-        cost += controller.stage_cost(x, u, theta, p, setpoint, now)
-        add_rows(("start", "both"), i, x, u)
+        u, p = inputs[:, i], controller.parameters(theta, nominal, signals[i])
+        cost += controller.stage_cost(x, u, theta, p, setpoint, now, before, signals[i])
+        add_rows(("start", "both"), i, x, u, theta, p, now, before, signals[i])
         gaps.append(states[:, i] - model.f(x, u, p))
         x = states[:, i]
-        add_rows(("end", "both"), i, x, u)
-    no_input = ca.MX(ca.DM.zeros(nu))
-    cost += controller.terminal_cost(x, no_input, theta, p, setpoint, now)
-    add_rows(("terminal",), horizon, x, no_input)
+        add_rows(("end", "both"), i, x, u, theta, p, now, before, signals[i + 1])
+        low, high, rate = (of(theta, p, now, signals[i]) for of in (controller.input_lower, controller.input_upper, controller.input_rate))
+        for j in controller.rated:
+            most, least = ca.fmax(before[j] + rate[j], low[j]), ca.fmin(before[j] - rate[j], high[j])
+            rows += [u[j] - most, least - u[j]] if i else []
+            low[j], high[j] = (low[j], high[j]) if i else (ca.fmax(low[j], least), ca.fmin(high[j], most))
+        bounds.append((low, high))
+        before = u
+    no_input, p = ca.MX(ca.DM.zeros(nu)), controller.parameters(theta, nominal, signals[horizon])
+    cost += controller.terminal_cost(x, no_input, theta, p, setpoint, now, before, signals[horizon])
+    add_rows(("terminal",), horizon, x, no_input, theta, p, now, before, signals[horizon])
     for j, limit in enumerate(controller.limits):
         cost += limit.penalty * (slack[j] + slack[j] ** 2 / (2 * limit.scale))
 
-    parameters = ca.vertcat(now, theta, setpoint, nominal)
+    parameters = ca.vertcat(now, theta, setpoint, nominal, last, given)
     nlp = {"x": ca.vertcat(ca.vec(inputs), ca.vec(states), slack), "p": parameters, "f": cost, "g": ca.vertcat(*gaps, *rows)}
-    arguments = [theta, nominal, now]
-    bounds = [controller.input_lower(theta, p, now), controller.input_upper(theta, p, now)]
+    arguments = [theta, nominal, now, last, given]
+    lower, upper = zip(*bounds, strict=True)
     return Nlp(
         solver=ca.nlpsol("nlp", "ipopt", nlp, OPTIONS),
         equalities=horizon * nx,
         inequalities=sum(row.shape[0] for row in rows),
-        bounds=ca.Function("bounds", arguments, bounds),
-        fallback=ca.Function("fallback", arguments, [controller.fallback(theta, p, now)]),
+        bounds=ca.Function("bounds", arguments, [ca.vertcat(*lower), ca.vertcat(*upper)]),
     )
 
 
 def ipopt_act(
-    controller: Controller, received: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory
+    controller: Controller,
+    received: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    memory: Memory,
+    given: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], Memory, Info]:
-    """One control step by IPOPT, with the signature of `mpc.act`; kkt is 0 where IPOPT reports success, else infinite."""
-    problem = problem_of(controller)
-    nlp = cached(f"ipopt {controller.structure}", lambda: multiple_shooting(controller))
-    model, horizon, nominal = controller.model, controller.horizon, controller.model.nominal
-    nx, nu, size = len(model.states), len(model.inputs), horizon * len(model.inputs)
-    q = problem.prepare(theta, ca.DM(controller.setpoint), nominal)
-    estimate, corrected = problem.correct(memory.estimator, received, memory.last_input, q)
+    """One control step by IPOPT, with the signature of `control_step.act`; kkt is 0 where IPOPT reports success, else infinite."""
+    problem, last = problem_of(controller), memory.last_input
+    q = numbers(controller, theta, given)
+    estimate, corrected = problem.correct(memory.estimator, received, last, q)
     now = np.array(estimate).ravel()
-    lower, upper = (np.array(bound).ravel() for bound in nlp.bounds(theta, nominal, np.where(np.isfinite(now), now, 0.0)))
+    plan, good = ipopt_plan(controller, now, theta, memory, given)
+    status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
+    if not np.all(np.isfinite(plan)):
+        known = problem.first(np.where(np.isfinite(now), now, 0.0), last)
+        declared = np.tile(np.array(problem.fallback(known, q)).ravel(), controller.horizon)
+        plan, status = np.array(problem.clip(known, declared, q)).ravel(), SolveStatus.FALLBACK
+    nu = len(controller.model.inputs)
+    u = plan[:nu]
+    ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
+    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[plan.size :]])
+    return u, Memory(ahead, u, following), Info(status, 0.0 if good else np.inf, _iterations(controller), now)
 
+
+def ipopt_plan(
+    controller: Controller, now: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory, given: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], bool]:
+    """(the inputs over the horizon from state ``now``, shape (N nu,), whether IPOPT reports success); NaN where it has no numbers.
+
+    It starts from the plan that ``memory`` holds.
+    """
+    nlp = _nlp(controller)
+    horizon, nominal = controller.horizon, controller.model.nominal
+    nx, size, slacks = len(controller.model.states), horizon * len(controller.model.inputs), len(controller.limits)
+    signals = np.zeros(len(controller.given) * (horizon + 2)) if given is None else given
+    arguments = (theta, nominal, np.where(np.isfinite(now), now, 0.0), memory.last_input, signals)
+    lower, upper = (np.array(bound).ravel() for bound in nlp.bounds(*arguments))
     warm = memory.warm[:size]
-    slacks = len(controller.limits)
-    guess = np.concatenate(
-        [np.clip(warm, np.tile(lower, horizon), np.tile(upper, horizon)), _roll_out(controller, now, warm, theta), np.zeros(slacks)]
-    )
+    guess = np.concatenate([np.clip(warm, lower, upper), _roll_out(controller, now, warm, theta, signals), np.zeros(slacks)])
     solution = nlp.solver(
         x0=guess,
-        p=np.concatenate([now, theta, controller.setpoint, nominal]),
-        lbx=np.concatenate([np.tile(lower, horizon), np.full(horizon * nx, -np.inf), np.zeros(slacks)]),
-        ubx=np.concatenate([np.tile(upper, horizon), np.full(horizon * nx + slacks, np.inf)]),
+        p=np.concatenate([now, theta, controller.setpoint, nominal, memory.last_input, signals]),
+        lbx=np.concatenate([lower, np.full(horizon * nx, -np.inf), np.zeros(slacks)]),
+        ubx=np.concatenate([upper, np.full(horizon * nx + slacks, np.inf)]),
         lbg=np.concatenate([np.zeros(nlp.equalities), np.full(nlp.inequalities, -np.inf)]),
         ubg=0.0,
     )
     found = np.array(solution["x"]).ravel()[:size]
-    good = bool(nlp.solver.stats()["success"]) and bool(np.all(np.isfinite(found)))
     if not np.all(np.isfinite(found)):
-        declared = np.array(nlp.fallback(theta, nominal, np.where(np.isfinite(now), now, 0.0))).ravel()
-        found, status = np.tile(declared, horizon), SolveStatus.FALLBACK
-    else:
-        status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
-    plan = np.clip(found, np.tile(lower, horizon), np.tile(upper, horizon))
-    u = plan[:nu]
-    ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
-    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[size:]])
-    info = Info(status, 0.0 if good else np.inf, int(nlp.solver.stats()["iter_count"]), now)
-    return u, Memory(ahead, u, following), info
+        return np.full(size, np.nan), False
+    problem = problem_of(controller)
+    known = problem.first(arguments[2], memory.last_input)
+    return np.array(problem.clip(known, found, numbers(controller, theta, given))).ravel(), bool(nlp.solver.stats()["success"])
+
+
+def _nlp(controller: Controller) -> Nlp:
+    return cached(f"ipopt {controller.structure}", lambda: multiple_shooting(controller))
+
+
+def _iterations(controller: Controller) -> int:
+    return int(_nlp(controller).solver.stats()["iter_count"])
 
 
 def _roll_out(
-    controller: Controller, now: NDArray[np.float64], inputs: NDArray[np.float64], theta: NDArray[np.float64]
+    controller: Controller, now: NDArray[np.float64], inputs: NDArray[np.float64], theta: NDArray[np.float64], given: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    p = controller.parameters(theta, controller.model.nominal)
-    x, out = now, []
-    for u in inputs.reshape(controller.horizon, -1):
+    x, out, horizon = now, [], controller.horizon
+    for u, signals in zip(inputs.reshape(horizon, -1), given.reshape(horizon + 2, -1)[1:], strict=False):
+        p = controller.parameters(theta, controller.model.nominal, signals)
         x = np.array(controller.model.f(x, u, p)).ravel()
         out.append(x)
     return np.concatenate(out)

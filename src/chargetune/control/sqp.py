@@ -50,15 +50,16 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     U is finite and within the bounds whatever happened: status FALLBACK means that it is the fallback input repeated.
     kkt is `Problem.residual` at U. ``warm`` is U and the QP's multipliers; `cold` makes the first one.
     """
-    size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.prepare.size1_out(0), _duals(problem)
+    size, nx, nq, duals = problem.size, problem.sweep.size1_in(0), problem.sweep.size1_in(2), _duals(problem)
     step = _iteration(problem, qp)
     last_one = problem.controller.iterations_max - 1
+    curved_from = 0 if problem.controller.hessian == "exact" else CURVED_FROM
     arguments = step.mx_in()[:-1]
-    *point, dual, kkt = step(*arguments, float(last_one >= CURVED_FROM))
+    *point, dual, kkt = step(*arguments, float(last_one >= curved_from))
     # Further iterations are nested branches, which cost nothing where the first iterate is a solution.
     more = ca.Function("more", arguments, [point[0], dual, kkt, ca.MX(1.0)])
     for iteration in reversed(range(last_one)):
-        *point, dual, kkt = step(*arguments, float(iteration >= CURVED_FROM))
+        *point, dual, kkt = step(*arguments, float(iteration >= curved_from))
         inputs = more.mx_in()
         done = ca.Function("done", inputs, [inputs[1], inputs[5], ca.MX(0.0), ca.MX(0.0)])
         # A NaN is not converged either, hence the negation.
@@ -69,15 +70,16 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
 
     now, warm, q = ca.MX.sym("now", nx), ca.MX.sym("warm", size + duals), ca.MX.sym("q", nq)
     # Bounds may depend on the estimate; they must stay numbers when it is not one.
-    known = ca.if_else(finite(ca.sum1(ca.fabs(now))), now, ca.DM.zeros(nx))
+    estimate, last_inputs = split(now, (nx - len(problem.controller.carried), len(problem.controller.carried)))
+    known = ca.vertcat(ca.if_else(finite(ca.sum1(ca.fabs(estimate))), estimate, ca.DM.zeros(estimate.shape[0])), last_inputs)
     lower, upper = problem.bounds(known, q)
     before, dual_before = split(warm, (size, duals))
-    start = ca.fmin(ca.fmax(before, lower), upper)
+    start = problem.clip(known, before, q)
     cost, rows, derivatives = problem.sweep(now, start, q)
     found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), dual_before, lower, upper, q)
     usable = finite(ca.sum1(ca.fabs(found)))
     declared = ca.repmat(problem.fallback(known, q), problem.controller.horizon, 1)
-    bounded = ca.fmin(ca.fmax(ca.if_else(usable, found, declared), lower), upper)
+    bounded = problem.clip(known, ca.if_else(usable, found, declared), q)
     status = ca.if_else(usable, ca.if_else(kkt <= KKT_TOLERANCE, SolveStatus.CONVERGED, SolveStatus.NOT_CONVERGED), SolveStatus.FALLBACK)
     usable_dual = ca.if_else(finite(ca.sum1(ca.fabs(dual))), dual, ca.DM.zeros(duals))
     following = ca.vertcat(bounded, usable_dual)[_shift(problem)]
@@ -113,7 +115,7 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     With ``bend`` = 1 it takes the curvature of constraints and dynamics into account, with 0 it is Gauss-Newton's.
     """
     limits = problem.controller.limits
-    nx, nq, rows = problem.sweep.size1_in(0), problem.prepare.size1_out(0), len(problem.groups)
+    nx, nq, rows = problem.sweep.size1_in(0), problem.sweep.size1_in(2), len(problem.groups)
     now, inputs, c, derivatives = (
         ca.MX.sym(n, k) for n, k in (("now", nx), ("U", problem.size), ("c", rows), ("D", problem.sweep.size1_out(2)))
     )
@@ -121,13 +123,18 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     lower, upper = ca.MX.sym("lower", problem.size), ca.MX.sym("upper", problem.size)
     bend = ca.MX.sym("bend")
     of = problem.curvature.mx_in()
-    straight = ca.Function("straight", of, [ca.DM.zeros(problem.size)])
+    straight = ca.Function("straight", of, [of[2]])
     curvature = ca.Function.if_else("curvature", problem.curvature, straight)
-    # Multipliers: of the slacks' bounds, of the inputs' bounds, of the rows.
+    # Multipliers, of the cost as it is: of the slacks' bounds, of the inputs' bounds, of the rows.
     sizes = (len(limits) + problem.size, rows)
     _, prices = split(dual, sizes)
-    bent = curvature(bend, now, inputs, derivatives, prices, lower, upper, q)
-    *data, span, gamma = problem.quadratic(inputs, c, derivatives, lower, upper, bent)
+    bent = curvature(bend, now, inputs, derivatives, prices, q)
+    if problem.controller.hessian == "exact":
+        bent = problem.convex(bent, lower, upper)
+        gamma = problem.scaling(bent, lower, upper)
+    else:
+        gamma = problem.scaling(derivatives, lower, upper)
+    *data, span = problem.quadratic(inputs, c, bent, lower, upper, gamma)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
@@ -136,7 +143,7 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     point = list(_line_search(problem)(now, inputs, span * direction, 1.0, allowed, q))
     _, prices = split(new_dual, sizes)
     kkt = problem.residual(*point[:3], prices, gamma, lower, upper)
-    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual, kkt])
+    return ca.Function("iteration", [now, inputs, c, derivatives, merit, dual, lower, upper, q, bend], [*point, new_dual / gamma, kkt])
 
 
 def _line_search(problem: Problem) -> ca.Function:
@@ -147,7 +154,7 @@ def _line_search(problem: Problem) -> ca.Function:
         "d": problem.size,
         "length": 1,
         "allowed": 1,
-        "q": problem.prepare.size1_out(0),
+        "q": problem.sweep.size1_in(2),
     }
     arguments = [ca.MX.sym(name, rows) for name, rows in sizes.items()]
     now, base, direction, length, allowed, q = arguments

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -17,12 +17,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.control_step import begin, control_step, problem_of
+from chargetune.control.control_step import control_step, problem_of
 from chargetune.control.controller import Controller
+from chargetune.control.first_guess import first_memory
 from chargetune.control.qp import QPSolver, daqp, daqp_warm, warm_sources
 from chargetune.episode.episode import Ending, Episode, Trip, ending_at, tripped
 from chargetune.episode.lookup_table import LookupTable
-from chargetune.episode.stepwise import check_run, signal_indices
+from chargetune.episode.stepwise import check_run, run_episode, signal_indices
+from chargetune.model.given import Given, actual, checked_given, windows
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 from chargetune.runtime.cache import cached
 from chargetune.runtime.compiler import compile_library, compiler_flags, find_compiler
@@ -51,83 +53,105 @@ class CompiledEpisode:
         nx, nu, ny = len(self.plant.model.states), len(self.plant.inputs), len(self.plant.outputs)
         return nx, nu, ny, ny, ny, ny, len(self.controller.model.states), 3
 
-    def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = ()) -> Episode:
-        """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed or trips do not fit."""
-        given, unknown = self._arguments(theta, self.plant, seed, trips)
-        (recorded,) = numpy_call(self.function, given, unknown)
-        return self._episode(recorded, self.plant, seed, trips)
+    def run(self, theta: ArrayLike | None = None, seed: int = 0, trips: Sequence[Trip] = (), *, given: Given | None = None) -> Episode:
+        """One closed loop; the same as `run_episode` on this plant. Raises ValueError when theta, seed, trips or given do not fit."""
+        fixed, unknown = self._arguments(theta, self.plant, seed, trips, self._told(given))
+        (recorded,) = numpy_call(self.function, fixed, unknown)
+        return self._episode(recorded, self.plant, seed, trips, unknown)
 
     def run_each(
         self,
         thetas: Sequence[ArrayLike | None],
         plants: Sequence[SimulatedPlant],
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         tables: Sequence[NDArray[np.float64] | None] | None = None,
+        *,
+        given: Given | None = None,
     ) -> list[Episode]:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
-        The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
+        The plants have the model of ``plant`` with other parameters, starts or sensors, and all the same given signals. The same
+        episodes as of one after the other. ``seed`` is one for all of them, or one each.
         What each of ``tables`` (`LookupTable`) says of the true outputs is added to what is measured, and so read by the estimator.
         Raises ValueError when there are not as many of all, or one does not fit.
         """
         tables = [None] * len(plants) if tables is None else tables
-        if not len(thetas) == len(plants) == len(tables):
-            raise ValueError(f"{len(thetas)} thetas, {len(plants)} plants and {len(tables)} tables, allowed are as many of each")
+        seeds = [seed] * len(plants) if isinstance(seed, int) else list(seed)
+        if not len(thetas) == len(plants) == len(tables) == len(seeds):
+            counts = f"{len(thetas)} thetas, {len(plants)} plants, {len(seeds)} seeds and {len(tables)} tables"
+            raise ValueError(f"{counts}, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
         # An ensemble has few thetas, slopes have few plants: what depends on one of them alone is computed once for each.
         of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
-        of_plant: dict[int, _OfPlant] = {}
-        given, unknown = [], []
-        for theta, plant, table in zip(thetas, plants, tables, strict=True):
+        of_plant: dict[tuple[int, int], _OfPlant] = {}
+        told = self._told(given)
+        fixed, unknown = [], []
+        for theta, plant, table, own in zip(thetas, plants, tables, seeds, strict=True):
             values = self.controller.theta_vector(theta)
             key = values.tobytes()
             if key not in of_theta:
-                of_theta[key] = self._of_theta(values)
-            if id(plant) not in of_plant:
-                check_run(plant, self.steps, seed, ())
-                of_plant[id(plant)] = self._of_plant(plant, seed)
-            given.append(self._given(of_theta[key], of_plant[id(plant)], table))
-            unknown.append(of_plant[id(plant)].unknown)
+                of_theta[key] = self._of_theta(values, told)
+            drawn = id(plant), own
+            if drawn not in of_plant:
+                check_run(plant, self.steps, own, ())
+                of_plant[drawn] = self._of_plant(plant, own, told)
+            fixed.append(self._given(of_theta[key], of_plant[drawn], table))
+            unknown.append(of_plant[drawn].unknown)
         run = partial(numpy_call, self.function)
         # The loops alone go into threads, as machine code: all else waits for the interpreter.
-        recorded = parallel_map(run, given, unknown) if self.compiled and len(plants) > 1 else list(map(run, given, unknown))
-        return [self._episode(one, plant, seed, ()) for (one,), plant in zip(recorded, plants, strict=True)]
+        recorded = parallel_map(run, fixed, unknown) if self.compiled and len(plants) > 1 else list(map(run, fixed, unknown))
+        return [self._episode(one, plant, own) for (one,), plant, own in zip(recorded, plants, seeds, strict=True)]
 
     def _arguments(
-        self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip]
+        self, theta: ArrayLike | None, plant: SimulatedPlant, seed: int, trips: Sequence[Trip], told: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What is given once an episode, shape (n,), and once an interval, shape (steps, m)."""
         check_run(plant, self.steps, seed, trips)
-        of_plant = self._of_plant(plant, seed)
-        return self._given(self._of_theta(self.controller.theta_vector(theta)), of_plant), of_plant.unknown
+        of_plant = self._of_plant(plant, seed, told)
+        return self._given(self._of_theta(self.controller.theta_vector(theta), told), of_plant), of_plant.unknown
 
-    def _of_theta(self, values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def _of_theta(self, values: NDArray[np.float64], told: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """The controller's memory at the start, and its numbers."""
-        memory = begin(self.controller)
+        memory = first_memory(self.controller, values, told[0, : told.shape[1] - len(self.plant.given)])
         q = problem_of(self.controller).prepare(values, self.controller.setpoint, self.controller.model.nominal)
         return [memory.estimator, memory.last_input, memory.warm, np.asarray(q, dtype=float).ravel()]
 
-    def _of_plant(self, plant: SimulatedPlant, seed: int) -> _OfPlant:
+    def _told(self, given: Given | None) -> NDArray[np.float64]:
+        """What the controller sees of the given signals and what the plant follows, a row an interval."""
+        names, read, horizon = self.controller.given_names, self.plant.given, self.controller.horizon
+        values = checked_given(tuple(dict.fromkeys((*names, *read))), given, self.steps, horizon)
+        seen = windows([values[name] for name in names], self.steps, horizon)
+        return np.concatenate([seen, actual([values[name] for name in read], self.steps)], axis=1)
+
+    def _of_plant(self, plant: SimulatedPlant, seed: int, told: NDArray[np.float64]) -> _OfPlant:
         errors, process = disturbances(plant, self.steps, seed)
         _, _, resolution = plant.sensors.vectors(plant.outputs)
         q = np.asarray(self.prepare_plant(plant.model.nominal), dtype=float).ravel()
-        unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process], axis=1)
-        return _OfPlant(plant.start_state, np.concatenate([q, resolution]), errors[0, 1], unknown)
+        unknown = np.concatenate([errors[1:].reshape(self.steps, -1), process, told], axis=1)
+        at_rest = np.concatenate([errors[0, 1], plant.rest_input, told[0, told.shape[1] - len(plant.given) :]])
+        return _OfPlant(plant.start_state, np.concatenate([q, resolution]), at_rest, unknown)
 
     def _given(
         self, of_theta: Sequence[NDArray[np.float64]], of_plant: _OfPlant, table: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        given = [of_plant.start, *of_theta, of_plant.numbers]
+        fixed = [of_plant.start, *of_theta, of_plant.numbers]
         if self.lookup_table is not None:
             nothing = np.zeros((len(self.lookup_table.outputs), self.lookup_table.size))
-            given.append(self.lookup_table.coefficients(nothing if table is None else table))
+            fixed.append(self.lookup_table.coefficients(nothing if table is None else table))
         elif table is not None:
             raise ValueError("a table was given, allowed is none: these episodes were built without a lookup_table")
-        return np.concatenate([*given, of_plant.at_rest])
+        return np.concatenate([*fixed, of_plant.at_rest])
 
-    def _episode(self, recorded: NDArray[np.float64], plant: SimulatedPlant, seed: int, trips: Sequence[Trip]) -> Episode:
+    def _episode(
+        self,
+        recorded: NDArray[np.float64],
+        plant: SimulatedPlant,
+        seed: int,
+        trips: Sequence[Trip] = (),
+        unknown: NDArray[np.float64] | None = None,
+    ) -> Episode:
         controller, start_state = self.controller, plant.start_state
         state, u, true_start, true_end, start, end, estimate, facts = np.split(recorded, np.cumsum(self.widths)[:-1], axis=1)
         episode = Episode(
@@ -150,12 +174,21 @@ class CompiledEpisode:
             true_end=true_end,
             state=np.vstack([start_state, state]),
         )
-        at_rest = tripped(plant, replace(plant).reset(seed), trips) if trips else ""
+        at_rest = tripped(plant, plant.following(_followed(plant, unknown)).reset(seed), trips) if trips and unknown is not None else ""
         return episode.cut(0, Ending.LIMIT, at_rest) if at_rest else _until_not_finite(episode, trips)
 
 
+def _followed(plant: SimulatedPlant, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The plant's own given signals, the last columns of what comes in each interval."""
+    return unknown[:, unknown.shape[1] - len(plant.given) :]
+
+
 class _OfPlant(NamedTuple):
-    """What an episode needs of its plant: state at the start, parameters and resolution, sensor error at rest, what no one foresees."""
+    """What an episode needs of its plant.
+
+    The state at the start, parameters and resolution, what holds at rest (sensor error, input, given signals), and what comes in each
+    interval (sensor errors, noise, given signals).
+    """
 
     start: NDArray[np.float64]
     numbers: NDArray[np.float64]
@@ -173,9 +206,15 @@ def compiled_episode(
     OSError when the function cannot be compiled.
     """
     check_run(plant, steps, 0, ())
+    if controller.solver != "sqp":
+        raise ValueError(
+            f"controller: solver = {controller.solver!r}, allowed is sqp where a whole episode is one function; use run_episode"
+        )
     indices = tuple(signal_indices(controller, plant))
     # A lookup_table finds the outputs by name.
-    own = f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.model.output_names} {plant.sensors.delay_steps}"
+    own = (
+        f"{_content(plant.model.f)} {_content(plant.model.h)} {plant.model.output_names} {plant.sensors.delay_steps} {plant.given_indices}"
+    )
     use = find_compiler() is not None if compiled is None else compiled
     key = f"episode {controller.structure} {own} {steps} {use and compiler_flags()} {compiled is None} {indices} {lookup_table}"
 
@@ -201,9 +240,12 @@ def simulate(
     seed: int = 0,
     trips: Sequence[Trip] = (),
     compiled: bool | None = None,
+    given: Given | None = None,
 ) -> Episode:
-    """One closed loop on a simulated plant, the quick way."""
-    return compiled_episode(controller, plant, steps, compiled=compiled).run(theta, seed, trips)
+    """One closed loop on a simulated plant, the quick way; ``given`` as for `run_episode`. A controller with IPOPT runs step by step."""
+    if controller.solver == "ipopt":
+        return run_episode(controller, plant, steps=steps, theta=theta, seed=seed, trips=trips, given=given)
+    return compiled_episode(controller, plant, steps, compiled=compiled).run(theta, seed, trips, given=given)
 
 
 def _until_not_finite(episode: Episode, trips: Sequence[Trip]) -> Episode:
@@ -248,13 +290,15 @@ def _built(
     """(the episode for CasADi's virtual machine, p -> q of the plant)."""
     control = control_step(problem_of(controller), qp)
     transition, output, prepare = _plant_functions(plant)
-    nx, ny, delay = len(plant.model.states), len(plant.outputs), plant.sensors.delay_steps
+    nx, ny, nu, delay = len(plant.model.states), len(plant.outputs), len(plant.inputs), plant.sensors.delay_steps
+    told, followed = len(controller.given) * (controller.horizon + 2), len(plant.given)
 
-    sizes = {"memory": control.size1_in(0), "u": control.size1_in(2), "warm": control.size1_in(3), "q": control.size1_in(4)}
+    sizes = {"memory": control.size1_in(0), "u": control.size1_in(2), "warm": control.size1_in(3), "q": control.size1_in(4) - told}
     x, sent = ca.MX.sym("x", nx), ca.MX.sym("sent", ny * (delay + 1))
     memory, last, warm, q = (ca.MX.sym(n, k) for n, k in sizes.items())
     plant_q, resolution = ca.MX.sym("plant_q", prepare.size1_out(0)), ca.MX.sym("resolution", ny)
     error_start, error_end, noise = ca.MX.sym("e0", ny), ca.MX.sym("e1", ny), ca.MX.sym("w", nx)
+    window, signals_now = ca.MX.sym("window", told), ca.MX.sym("given", followed)
     measure, added = _measure(ny), lookup_table.function(plant.model.output_names, plant.model.input_names) if lookup_table else None
     table = ca.MX.sym("table", added.size1_in(2) if added else 0)
 
@@ -265,28 +309,28 @@ def _built(
     arriving, underway = split(sent, (ny, ny * delay))
     signals = split(arriving, [1] * ny)
     received = ca.vertcat(ca.MX(0, 1), *(signals[i] for i in indices))
-    u, ahead, following, status, kkt, count, estimate = control(memory, received, last, warm, q)
-    after = transition(x, u, plant_q) + noise
-    before_y, after_y = output(x, u, plant_q), output(after, u, plant_q)
+    u, ahead, following, status, kkt, count, estimate = control(memory, received, last, warm, ca.vertcat(q, window) if told else q)
+    after = transition(x, u, plant_q, signals_now) + noise
+    before_y, after_y = output(x, u, plant_q, signals_now), output(after, u, plant_q, signals_now)
     start = measure(before_y, error_start + errs(before_y, u, table), resolution)
     end = measure(after_y, error_end + errs(after_y, u, table), resolution)
     carried, fixed = [x, memory, last, warm, sent], [q, plant_q, resolution, table]
-    unknown = ca.vertcat(error_start, error_end, noise)
-    unknowns = ca.MX.sym("unknown", unknown.shape[0])
-    step = ca.Function("plain_step", [*carried, *fixed, error_start, error_end, noise], [
+    parts = [error_start, error_end, noise, window, signals_now]
+    unknowns = ca.MX.sym("unknown", sum(part.shape[0] for part in parts))
+    step = ca.Function("plain_step", [*carried, *fixed, *parts], [
         after, ahead, u, following, ca.vertcat(underway, end),
         ca.vertcat(after, u, before_y, after_y, start, end, estimate, status, kkt, count),
     ])  # fmt: skip
-    parts = split(unknowns, (ny, ny, nx))
-    step = ca.Function("step", [*carried, *fixed, unknowns], list(step(*carried, *fixed, *parts)))
+    of_interval = split(unknowns, [part.shape[0] for part in parts])
+    step = ca.Function("step", [*carried, *fixed, unknowns], list(step(*carried, *fixed, *of_interval)))
 
-    first = [x, memory, last, warm, q, plant_q, resolution, table, ca.MX.sym("e_rest", ny)]
+    rest_of = [ca.MX.sym("e_rest", ny), ca.MX.sym("u_rest", nu), ca.MX.sym("given_rest", followed)]
+    first = [x, memory, last, warm, q, plant_q, resolution, table, *rest_of]
     given = ca.MX.sym("given", sum(v.shape[0] for v in first))
-    x0, memory0, last0, warm0, *fixed0, error = split(given, [v.shape[0] for v in first])
-    nothing = ca.MX.zeros(len(plant.inputs))
-    rest_y = output(x0, nothing, fixed0[1])
-    rest = measure(rest_y, error + errs(rest_y, nothing, fixed0[3]), fixed0[2])
-    unknown_matrix = ca.MX.sym("unknown", unknown.shape[0], steps)
+    x0, memory0, last0, warm0, *fixed0, error, u_rest, signals_rest = split(given, [v.shape[0] for v in first])
+    rest_y = output(x0, u_rest, fixed0[1], signals_rest)
+    rest = measure(rest_y, error + errs(rest_y, u_rest, fixed0[3]), fixed0[2])
+    unknown_matrix = ca.MX.sym("unknown", unknowns.shape[0], steps)
     *_, recorded = _repeat(step, len(carried), steps)(x0, memory0, last0, warm0, ca.repmat(rest, delay + 1, 1), *fixed0, unknown_matrix)
     return ca.Function("episode", [given, unknown_matrix], [recorded]), prepare
 
@@ -317,14 +361,17 @@ def _repeat(step: ca.Function, carried: int, count: int) -> ca.Function:
 
 
 def _plant_functions(plant: SimulatedPlant) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """((x, u, q) -> x+, (x, u, q) -> y, p -> q) with q computed once an episode."""
+    """((x, u, q, given) -> x+, (x, u, q, given) -> y, p -> q) with q computed once an episode."""
     model = plant.model
     x, u = ca.SX.sym("x", len(model.states)), ca.SX.sym("u", len(model.inputs))
-    p = ca.SX.sym("p", model.nominal.size)
-    (after, y), symbols, values = ca.extract_parametric([model.f(x, u, p), model.h(x, u, p)], p, {"extract_trivial": True})
+    p, given = ca.SX.sym("p", model.nominal.size), ca.SX.sym("given", len(plant.given))
+    own = ca.SX(p)
+    for i, index in enumerate(plant.given_indices):
+        own[index] = given[i]
+    (after, y), symbols, values = ca.extract_parametric([model.f(x, u, own), model.h(x, u, own)], p, {"extract_trivial": True})
     q = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
-    transition = ca.Function("transition", [x, u, q], [ca.cse(ca.densify(after))])
-    output = ca.Function("output", [x, u, q], [ca.cse(ca.densify(y))])
+    transition = ca.Function("transition", [x, u, q, given], [ca.cse(ca.densify(after))])
+    output = ca.Function("output", [x, u, q, given], [ca.cse(ca.densify(y))])
     return transition, output, ca.Function("prepare_plant", [p], [ca.vertcat(*values) if values else ca.SX(0, 1)])
 
 

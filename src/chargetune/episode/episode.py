@@ -93,6 +93,11 @@ class Episode:
         """Control steps that were not solved to tolerance."""
         return int(np.sum(self.status != SolveStatus.CONVERGED))
 
+    @property
+    def unsolved_share(self) -> float:
+        """The share of control steps that were not solved to tolerance, 0 .. 1; 0 of an episode without any."""
+        return self.failures / len(self) if len(self) else 0.0
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Every array by name, for the store."""
         return {name: getattr(self, name) for name in ARRAYS if getattr(self, name) is not None}
@@ -121,7 +126,7 @@ class Episode:
         head: dict[str, str | float] = {
             "ending": f"{self.ending.value} {self.message}".strip(),
             "intervals": f"{len(self)} of {self.sampling_time_s:g} s",
-            "steps not solved": self.failures,
+            "steps not solved": f"{self.failures} ({100 * self.unsolved_share:.3g} %)",
         }
         inputs = {f"{n} ({u})": self.input[:, i] for i, (n, u) in enumerate(zip(self.input_names, self.input_units, strict=True))}
         outputs = {f"{n} ({u})": self.output_end[:, i] for i, (n, u) in enumerate(zip(self.output_names, self.output_units, strict=True))}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score, in_tolerances
+from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Evaluation", "ScoredLimit", "Windows", "limit_samples", "moving_mean", "score_limits", "violation", "worst_by_window"]
 
@@ -47,13 +48,13 @@ class ScoredLimit:
             raise ValueError(f"limit {self.name}: neither lower nor upper is given")
         for field in ("lower", "upper", "tolerance"):
             value = getattr(self, field)
-            if value is not None and not _finite(value):
+            if value is not None and not is_finite(value):
                 raise ValueError(f"limit {self.name}: {field} = {value!r}, allowed is a finite number")
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise ValueError(f"limit {self.name}: lower = {self.lower} must be less than upper = {self.upper}")
         if self.tolerance < 0:
             raise ValueError(f"limit {self.name}: tolerance = {self.tolerance!r}, allowed is >= 0")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
+        if not is_integer(self.samples) or self.samples < 1:
             raise ValueError(f"limit {self.name}: samples = {self.samples!r}, allowed is an integer >= 1")
 
     def excess(self, episode: Episode) -> NDArray[np.float64]:
@@ -66,9 +67,14 @@ class ScoredLimit:
 
     def excess_at_ends(self, episode: Episode) -> NDArray[np.float64]:
         """The excess at both ends of each interval, shape (2, K); nan where it is not known."""
-        values = np.stack([moving_mean(_known(v), self.samples) for v in episode.signal(self.signal)])
-        above = -np.inf if self.upper is None else values - self.upper
-        below = -np.inf if self.lower is None else self.lower - values
+        values = _known(np.stack(episode.signal(self.signal)))
+        if self.samples > 1:
+            values = np.stack([moving_mean(v, self.samples) for v in values])
+        # One side costs no maximum: safe mode judges a thousand episodes for a proposal.
+        above = None if self.upper is None else values - self.upper
+        below = None if self.lower is None else self.lower - values
+        if above is None or below is None:
+            return np.asarray(below if above is None else above, dtype=np.float64)
         return np.asarray(np.maximum(above, below), dtype=np.float64)
 
 
@@ -82,18 +88,21 @@ class Windows:
     count: int
 
     def __post_init__(self) -> None:
-        if not (_finite(self.lower) and _finite(self.upper) and self.lower < self.upper):
+        if not (is_finite(self.lower) and is_finite(self.upper) and self.lower < self.upper):
             raise ValueError(f"windows of {self.signal}: [{self.lower!r}, {self.upper!r}], allowed are finite numbers, the first one less")
-        if isinstance(self.count, bool) or not isinstance(self.count, int) or self.count < 1:
+        if not is_integer(self.count) or self.count < 1:
             raise ValueError(f"windows of {self.signal}: count = {self.count!r}, allowed is an integer >= 1")
 
     def of(self, episode: Episode) -> NDArray[np.int_]:
         """The window of each interval, shape (K,), from 0 on. Where the signal was lost it is what lies between its neighbours."""
         _, values = episode.signal(self.signal)
-        known, at = np.isfinite(values), np.arange(values.size)
+        known = np.isfinite(values)
         if not known.any():
             return np.zeros(values.size, dtype=np.int_)
-        share = (np.interp(at, at[known], values[known]) - self.lower) / (self.upper - self.lower)
+        if not known.all():
+            at = np.arange(values.size)
+            values = np.interp(at, at[known], values[known])
+        share = (values - self.lower) / (self.upper - self.lower)
         return np.clip(np.floor(share * self.count).astype(np.int_), 0, self.count - 1)
 
 
@@ -131,6 +140,8 @@ def score_limits(
         so that ``penalty`` is what a violation of one more tolerance costs, in the unit of the objective.
     windows
         With them the score has the profile of the limits.
+    metrics
+        Episode -> figures for people; ``unsolved_percent``, the share of control steps that were not solved, is always one of them.
 
     Raises ValueError for unknown signals and for two limits of one name.
     """
@@ -158,7 +169,7 @@ def score_limits(
         performance=total,
         excess=excess,
         tolerance={limit.name: limit.tolerance for limit in limits},
-        metrics={} if metrics is None else metrics(episode),
+        metrics={"unsolved_percent": 100 * episode.unsolved_share, **({} if metrics is None else metrics(episode))},
         profile={}
         if windows is None
         else {limit.name: worst_by_window(*samples[limit.name], windows.count) for limit in limits if limit.by_window},
@@ -214,8 +225,5 @@ def moving_mean(values: NDArray[np.float64], samples: int) -> NDArray[np.float64
 
 
 def _known(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float64)
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    finite = np.isfinite(values)
+    return values if finite.all() else np.asarray(np.where(finite, values, np.nan), dtype=np.float64)

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chargetune.control.control_step import Act, act, begin
+from chargetune.control.control_step import Act
 from chargetune.control.controller import Controller
+from chargetune.control.first_guess import act_of, first_memory
 from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
-from chargetune.plants.plant import Measurement, Plant, PlantError
+from chargetune.model.given import Given, actual, checked_given, windows
+from chargetune.plants.plant import Measurement, Plant, PlantError, SetUpError
+from chargetune.runtime.numeric import is_integer
 
 __all__ = ["check_run", "run_episode", "signal_indices"]
 
@@ -27,11 +30,14 @@ def run_episode(
     theta: ArrayLike | None = None,
     seed: int = 0,
     trips: Sequence[Trip] = (),
-    control: Act = act,
+    control: Act | None = None,
+    given: Given | None = None,
 ) -> Episode:
     """Run one closed loop step by step on any plant. It always returns: a failure is the episode's ending.
 
-    ``control`` is the control step, `ipopt_act` for the reference solver.
+    ``control`` is the control step, by default that of the controller's ``solver``; `ipopt_act` is the reference. ``given`` has
+    the given signals of the controller and of the plant by name (`model.given.checked_given`): numbers, sequences of at least
+    ``steps`` values, or forecasts.
 
     The plant is closed at the end, whatever happened, and before anything else is done with the result. What the plant
     raises ends the episode as PLANT, what the controller raises as SOLVER; the intervals until then are kept. A plant
@@ -41,17 +47,21 @@ def run_episode(
     values = controller.theta_vector(theta)
     indices = signal_indices(controller, plant)
     check_run(plant, steps, seed, trips)
+    seen, plant = _told(controller, plant, given, steps)
+    step = control or act_of(controller)
     records: list[tuple[NDArray[np.float64], Measurement, SolveStatus, float, int, NDArray[np.float64]]] = []
     ending, message = Ending.DONE, ""
     first: Measurement | None = None
     blind = broken = 0
     try:
         first = _asked(plant, partial(plant.reset, seed))
-        memory, measurement = begin(controller), first
+        memory, measurement = first_memory(controller, values, seen[0] if controller.given else None), first
         message = tripped(plant, first, trips)
         ending = Ending.LIMIT if message else Ending.DONE
-        for _ in range(0 if message else steps):
-            u, memory, info = control(controller, measurement.received[indices], values, memory)
+        for k in range(0 if message else steps):
+            # A control step for controllers without given signals need not know of them.
+            known = (seen[k],) if controller.given else ()
+            u, memory, info = step(controller, measurement.received[indices], values, memory, *known)
             _refuse_unusable(u, len(plant.inputs))
             measurement = _asked(plant, partial(plant.step, u))
             records.append((u, measurement, info.status, info.kkt, info.iterations, info.estimate))
@@ -59,6 +69,9 @@ def run_episode(
             broken = broken + 1 if info.status == SolveStatus.FALLBACK else 0
             if blind >= BLIND_MAX or broken >= BLIND_MAX or tripped(plant, measurement, trips):
                 break
+    except SetUpError:
+        # No interval of it could ever run, so there is no episode to tell of.
+        raise
     except PlantError as error:
         ending, message = Ending.PLANT, str(error)
     except KeyboardInterrupt:
@@ -74,11 +87,22 @@ def run_episode(
     return episode
 
 
+def _told(controller: Controller, plant: Plant, given: Given | None, steps: int) -> tuple[NDArray[np.float64], Plant]:
+    """(what the controller sees of the given signals in each interval, the plant that follows its own)."""
+    read = tuple(getattr(plant, "given", ()))
+    values = checked_given(tuple(dict.fromkeys((*controller.given_names, *read))), given, steps, controller.horizon)
+    seen = windows([values[name] for name in controller.given_names], steps, controller.horizon)
+    if not read:
+        return seen, plant
+    follower: Any = plant
+    return seen, follower.following(actual([values[name] for name in read], steps))
+
+
 def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
     """What the plant answers; anything it raises, and an answer of the wrong shape, is a `PlantError`."""
     try:
         measurement = call()
-    except PlantError:
+    except (PlantError, SetUpError):
         raise
     except Exception as error:
         raise PlantError(f"the plant raised {type(error).__name__}: {error}") from error
@@ -159,7 +183,7 @@ def signal_indices(controller: Controller, plant: Plant) -> list[int]:
 def check_run(plant: Plant, steps: int, seed: int, trips: Sequence[Trip]) -> None:
     """Raises ValueError when an episode cannot be run with these: field, value and what is allowed."""
     for name, value, least in (("steps", steps, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        if not is_integer(value) or value < least:
             raise ValueError(f"{name} = {value!r}, allowed is an integer >= {least}")
     names = [s.name for s in plant.outputs]
     unknown = sorted({trip.signal for trip in trips} - set(names))

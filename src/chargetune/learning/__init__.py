@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from chargetune.learning.black_box.gaussian_process import GaussianProcess
     from chargetune.learning.closed_loop.iterative_learning import IterativeLearning
     from chargetune.learning.initial_design import Sobol
+    from chargetune.learning.range_of_use.range_loop import SimulatedRange
+    from chargetune.learning.range_of_use.range_tuner import RangeSettings, RangeTuner
+    from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.tuner import TrialLike, Tuner
     from chargetune.learning.twin.posterior import Posterior
@@ -30,7 +33,11 @@ __all__ = [
     "IterativeLearning",
     "NoSafeThetaError",
     "Posterior",
+    "RangeEvaluation",
+    "RangeSettings",
+    "RangeTuner",
     "Safety",
+    "SimulatedRange",
     "SimulatedTwin",
     "Sobol",
     "TrialLike",
@@ -44,12 +51,16 @@ __all__ = [
 _MODULES = {
     "Composite": "black_box.composite",
     "ConstrainedLogEI": "black_box.constrained_ei",
-    "IterativeLearning": "closed_loop.iterative_learning",
     "ExpectedImprovement": "black_box.expected_improvement",
     "GaussianProcess": "black_box.gaussian_process",
+    "IterativeLearning": "closed_loop.iterative_learning",
     "NoSafeThetaError": "safety",
     "Posterior": "twin.posterior",
+    "RangeEvaluation": "range_of_use.range_verdict",
+    "RangeSettings": "range_of_use.range_tuner",
+    "RangeTuner": "range_of_use.range_tuner",
     "Safety": "safety",
+    "SimulatedRange": "range_of_use.range_loop",
     "SimulatedTwin": "twin.simulated_twin",
     "Sobol": "initial_design",
     "TrialLike": "tuner",

@@ -11,6 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.model.integrators import rk4
+from chargetune.runtime.numeric import is_finite
 from chargetune.runtime.split import split
 
 __all__ = ["Model", "Named", "Signal"]
@@ -122,6 +124,46 @@ class Model:
             h=h,
         )
 
+    @classmethod
+    def from_casadi(
+        cls,
+        name: str,
+        f: ca.Function,
+        h: ca.Function | None = None,
+        *,
+        states: Sequence[Signal | str],
+        inputs: Sequence[Signal | str],
+        outputs: Sequence[Signal | str] | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        sampling_time_s: float,
+        continuous: bool = False,
+        substeps: int = 1,
+    ) -> Model:
+        """Make a model from CasADi functions (x, u) or (x, u, p), as do-mpc, acados and safe-control-gym have them.
+
+        f is the next state, or with ``continuous`` dx/dt, which `rk4` integrates over an interval in ``substeps``. Without ``h`` the
+        outputs are the states. ``parameters`` names the blocks of p in order with their values. Raises ValueError when sizes do not
+        fit, and when a function cannot be written out in scalar operations, as an integrator within it cannot.
+        """
+        blocks = {key: np.atleast_1d(np.asarray(value, dtype=float)) for key, value in (parameters or {}).items()}
+        named = [tuple(s if isinstance(s, Signal) else Signal(s) for s in signals) for signals in (states, inputs, outputs or states)]
+        sizes = [len(named[0]), len(named[1]), sum(value.size for value in blocks.values())]
+        x, u, p = (ca.SX.sym(label, size) for label, size in zip("xup", sizes, strict=True))
+        follow = _scalar(f"model {name}: f", f, sizes, sizes[0])
+
+        def rate(at: Any) -> Any:
+            return follow(at, u, p)
+
+        after = rk4(rate, x, sampling_time_s, substeps) if continuous else rate(x)
+        if h is None and outputs is not None and [s.name for s in named[2]] != [s.name for s in named[0]]:
+            raise ValueError(f"model {name}: outputs = {[s.name for s in named[2]]} without h, allowed are the states")
+        seen = x if h is None else _scalar(f"model {name}: h", h, sizes, len(named[2]))(x, u, p)
+        functions = [
+            ca.Function(n, [x, u, p], [ca.densify(e)], ["x", "u", "p"], [o]) for n, e, o in (("f", after, "x_next"), ("h", seen, "y"))
+        ]
+        flat = tuple((key, tuple(float(v) for v in value)) for key, value in blocks.items())
+        return cls(name, named[0], named[1], named[2], flat, sampling_time_s, functions[0], functions[1])
+
     @property
     def state_names(self) -> tuple[str, ...]:
         return tuple(s.name for s in self.states)
@@ -156,6 +198,26 @@ class Model:
         return Model(self.name, self.states, self.inputs, self.outputs, merged, self.sampling_time_s, self.f, self.h)
 
 
+def _scalar(where: str, function: ca.Function, sizes: Sequence[int], rows: int) -> Callable[[Any, Any, Any], Any]:
+    """A CasADi function as one of (x, u, p) in scalar operations."""
+    count = 3 if function.n_in() > 2 else 2
+    expected = list(sizes[:count]) if count == 3 or not sizes[2] else list(sizes)
+    shapes = [function.numel_in(i) for i in range(function.n_in())]
+    if shapes != expected or function.numel_out(0) != rows:
+        raise ValueError(f"{where} maps sizes {shapes} to {function.numel_out(0)}, expected (x, u, p) of {expected} to {rows}")
+    try:
+        plain = function if function.is_a("SXFunction") else function.expand()
+    except RuntimeError as error:
+        raise ValueError(f"{where} cannot be written out in scalar operations (CasADi's expand): {error}") from error
+    if any(plain.instruction_id(k) == ca.OP_CALL for k in range(plain.n_instructions())):
+        raise ValueError(f"{where} cannot be written out in scalar operations: it calls a function that is none, such as an integrator")
+
+    def called(x: Any, u: Any, p: Any) -> Any:
+        return ca.vec(plain.call([x, u, p][:count])[0])
+
+    return called
+
+
 def _check_names(model: str, states: Sequence[Signal], inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
     for field, signals, minimum in (("states", states, 1), ("inputs", inputs, 1), ("outputs", outputs, 0)):
         names = [s.name for s in signals]
@@ -172,4 +234,4 @@ def _stack(values: Mapping[str, Any], signals: Sequence[Signal], where: str) -> 
 
 
 def _positive(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+    return is_finite(value) and value > 0  # type: ignore[operator]

@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.runtime.numeric import is_finite, is_integer
+
 __all__ = ["Parameter", "ParameterSpace"]
 
 Scale = Literal["linear", "log"]
@@ -34,13 +36,13 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "[], \t\n"):
             raise ValueError(f"parameter name {self.name!r}: allowed is a non-empty name without spaces, commas or brackets")
-        if isinstance(self.size, bool) or not isinstance(self.size, int) or self.size < 1:
+        if not is_integer(self.size) or self.size < 1:
             raise ValueError(f"parameter {self.name}: size = {self.size!r}, allowed is an integer >= 1")
         if self.scale not in ("linear", "log"):
             raise ValueError(f"parameter {self.name}: scale = {self.scale!r}, allowed is 'linear' or 'log'")
         for field in ("lower", "upper"):
             value = getattr(self, field)
-            if not _is_number(value):
+            if not is_finite(value):
                 raise ValueError(f"parameter {self.name}: {field} = {value!r}, allowed is a finite number")
         if self.lower >= self.upper:
             raise ValueError(f"parameter {self.name}: lower = {self.lower:g} must be less than upper = {self.upper:g}")
@@ -50,9 +52,12 @@ class Parameter:
         if len(values) != self.size:
             raise ValueError(f"parameter {self.name}: default has {len(values)} values, expected {self.size}")
         for value in values:
-            if not _is_number(value) or not self.lower <= value <= self.upper:
+            if not is_finite(value) or not self.lower <= value <= self.upper:
                 raise ValueError(f"parameter {self.name}: default = {value!r}, allowed is [{self.lower:g}, {self.upper:g}] {self.unit}")
         object.__setattr__(self, "default", tuple(float(v) for v in values))
+        # NumPy's numbers become Python's, which JSON knows.
+        for field, kind in (("lower", float), ("upper", float), ("size", int)):
+            object.__setattr__(self, field, kind(getattr(self, field)))
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -156,7 +161,3 @@ class ParameterSpace:
             np.where(log, np.log(np.where(log, low, 1.0)), low),
             np.where(log, np.log(np.where(log, high, 1.0)), high),
         )
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

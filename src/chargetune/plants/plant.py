@@ -10,11 +10,25 @@ from numpy.typing import NDArray
 
 from chargetune.model.model import Signal
 
-__all__ = ["Measurement", "Plant", "PlantError"]
+__all__ = ["Measurement", "Plant", "PlantError", "SetUpError"]
 
 
 class PlantError(RuntimeError):
     """The plant could not carry out the interval (solver failure, lost connection); the episode ends with this reason."""
+
+
+class SetUpError(ValueError):
+    """What is evaluated can never work, whatever theta is: a study ends with it, and no trial is recorded as failed.
+
+    ``details`` is the traceback of what led to it, as text, where that is known.
+    """
+
+    def __init__(self, message: str, details: str = "") -> None:
+        super().__init__(message, details)
+        self.message, self.details = message, details
+
+    def __str__(self) -> str:
+        return self.message
 
 
 @dataclass(frozen=True)

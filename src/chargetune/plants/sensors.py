@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from chargetune.model.model import Signal
 from chargetune.plants.plant import Measurement
+from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Readout", "Sensors"]
 
@@ -32,11 +32,10 @@ class Sensors:
     def __post_init__(self) -> None:
         for name in ("noise_sd", "bias", "resolution"):
             for signal, value in getattr(self, name).items():
-                number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-                if not number or (name != "bias" and value < 0):
+                if not is_finite(value) or (name != "bias" and value < 0):
                     allowed = "a finite number" if name == "bias" else "a finite number >= 0"
                     raise ValueError(f"sensors: {name} of {signal} = {value!r}, allowed is {allowed}")
-        if isinstance(self.delay_steps, bool) or not isinstance(self.delay_steps, int) or not 0 <= self.delay_steps <= 100:
+        if not is_integer(self.delay_steps) or not 0 <= self.delay_steps <= 100:
             raise ValueError(f"sensors: delay_steps = {self.delay_steps!r}, allowed is an integer in [0, 100]")
 
     def vectors(self, outputs: tuple[Signal, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem, judged_exactly
 from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.episode.episode import Episode
 from chargetune.model.parameter_space import ParameterSpace
@@ -133,13 +133,18 @@ def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list
 
 def _view(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
     config = record.identity["config"]
+    tuner = str(config.get("study", {}).get("tuner", ""))
+    problem = problem_of_document(config) if "cell" in config else None
+    if problem is not None and tuner == "range":
+        # Its traces hold true outputs.
+        problem = judged_exactly(problem)
     return StudyView(
         location=store.location,
         name=record.name,
-        tuner=str(config.get("study", {}).get("tuner", "")),
+        tuner=tuner,
         space=space_from_json(record.identity["space"]),
         trials=tuple(trials),
-        problem=problem_of_document(config) if "cell" in config else None,
+        problem=problem,
         result=read_result(store, record, trials),
         record=record,
     )

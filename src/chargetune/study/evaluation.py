@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,10 +11,14 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
+from chargetune.plants.plant import SetUpError
 from chargetune.study.serialization import score_to_json
 from chargetune.study.store.trace import Traceable, encode
 
 __all__ = ["Evaluate", "Outcome", "evaluate_trial", "trial_seed"]
+
+# Errors of a program, not of a theta: what is missing, misspelt or called in a wrong way is so for every theta.
+PROGRAM = (ImportError, NameError, TypeError, KeyError, AttributeError, NotImplementedError)
 
 # theta and a seed -> score (None: the episode is worth none), trace (None: there is none), why the episode ended
 Evaluate = Callable[[NDArray[np.float64], int], tuple[Score | None, Traceable | None, str]]
@@ -37,12 +42,17 @@ def trial_seed(study_seed: int, number: int) -> int:
 def evaluate_trial(evaluate: Evaluate, theta: tuple[float, ...], seed: int) -> Outcome:
     """Run one evaluation. What it raises, or returns against its contract, becomes an outcome without score that says so.
 
+    Raises SetUpError, with the traceback, where no theta could work: for `PROGRAM` errors, and for what the plant refuses.
     KeyboardInterrupt and SystemExit pass through: they stop the study, they say nothing about theta. So does an episode that the user
     interrupted, which `run_episode` returns as such.
     """
     try:
         score, episode, ending = evaluate(np.array(theta), seed)
         trace = None if episode is None else encode(episode.arrays(), episode.meta())
+    except SetUpError as error:
+        raise SetUpError(str(error), error.details or traceback.format_exc()) from error
+    except PROGRAM as error:
+        raise SetUpError(f"{type(error).__name__}: {error}", traceback.format_exc()) from error
     except Exception as error:  # noqa: BLE001 - whatever a plant or a controller raises is this trial's failure, not the study's
         return Outcome(None, None, f"{type(error).__name__}: {error}")
     if isinstance(episode, Episode) and episode.ending is Ending.INTERRUPTED:

@@ -8,6 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from dataclasses import dataclass
 from typing import NoReturn
 
+from chargetune.plants.plant import SetUpError
 from chargetune.study.evaluation import Evaluate, Outcome, evaluate_trial
 from chargetune.study.executors import ProcessExecutor
 from chargetune.study.trial import Trial
@@ -139,6 +140,8 @@ def _then(call: _Call, future: Future[Outcome | None], losses: Losses) -> _Call 
     """The outcome of a call, or what a worker is given next."""
     try:
         outcome = future.result()
+    except SetUpError:
+        raise
     except (Exception, CancelledError) as error:  # noqa: BLE001 - each executor has its own errors
         # An evaluation does not raise, so an error is the executor's and says nothing about theta.
         if call.lost_by is not None:

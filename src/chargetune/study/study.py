@@ -15,7 +15,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.episode.episode import Episode
+from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.study.dataframe import study_html, trials_dataframe
@@ -35,7 +35,10 @@ from chargetune.study.store.trace import Traceable, encode
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 from chargetune.study.warm_start import Earlier, read_earlier
 
-__all__ = ["Proposer", "Study", "StudyError", "WorkerError"]
+__all__ = ["SAME_FAILURES", "Proposer", "Study", "StudyError", "WorkerError"]
+
+# Trials that fail for one and the same reason from the first one on, until the study is not gone on with.
+SAME_FAILURES = 3
 
 
 # The same as learning's Tuner, written again because importing that folder loads torch, which showing a study does not need.
@@ -267,10 +270,13 @@ class Study:
             True shows a bar, in a notebook as a widget (`tqdm.auto`, extra ``notebook``).
 
         Trials that a dead process left running are evaluated first, again, with the same theta and seed. What ``evaluate`` raises
-        makes that trial failed and the study goes on. On Ctrl-C evaluations that did not begin are cancelled and KeyboardInterrupt
-        passes on; the same call resumes. When all are told the tuner is asked for the `result`; `advance` leaves that out.
-        Raises ValueError for bad arguments, WorkerError when the executor gives no results, StudyError for trials that may not be
-        repeated.
+        makes that trial failed and the study goes on; but an error that no theta could avoid (a name that is not known, a package
+        that is missing, a plant that refuses its set-up) ends it, and the trial stays to be evaluated when that is mended. So does one
+        and the same reason in each of the first `SAME_FAILURES` trials. On Ctrl-C evaluations that did not begin are cancelled and
+        KeyboardInterrupt passes on; the same call resumes. When all are told the tuner is asked for the `result`; `advance` leaves
+        that out.
+        Raises ValueError for bad arguments, SetUpError for such an error, WorkerError when the executor gives no results, StudyError
+        for trials that may not be repeated.
         """
         self.advance(evaluate, trials, executor=executor, workers=workers, attempts=attempts, progress=progress)
         return self.result().kept
@@ -326,6 +332,8 @@ class Study:
             finished = stack.enter_context(closing(outcomes(evaluate, following, executor, losses)))
             for trial, outcome in finished:
                 tally.add(self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt))
+                if outcome.score is None:
+                    _refuse_sameness(self.trials())
 
     def _ask_ahead(self, limit: int) -> list[Trial]:
         """One more trial while others are running; none when there are ``limit`` trials."""
@@ -369,6 +377,15 @@ class Study:
 
     def _provenance(self) -> dict[str, Any]:
         return {"study_sha256": self.record.identity_sha256, "versions": versions()}
+
+
+def _refuse_sameness(trials: Sequence[Trial]) -> None:
+    """StudyError when the first trials failed, as many as there are, and all for the same reason."""
+    told = [t for t in trials if t.status is not TrialStatus.RUNNING]
+    # A loop that was ended at a limit says something of its theta.
+    failed = all(t.score is None and not (t.ending or "").startswith(Ending.LIMIT.value) for t in told)
+    if failed and len(told) == SAME_FAILURES and len({t.ending for t in told}) == 1:
+        raise StudyError(f"each of the first {SAME_FAILURES} trials failed for the same reason, so others would too: {told[0].ending}")
 
 
 def _take_lease(store: Store, record: StudyRecord) -> Hold:

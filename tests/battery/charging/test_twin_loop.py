@@ -19,10 +19,15 @@ from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning import Safety, TwinTuner
 from chargetune.learning.twin.ensemble import condition
 from chargetune.learning.twin.laplace import fit
+from chargetune.learning.twin.settings import TwinSettings
 from chargetune.plants.simulated import SimulatedPlant
 from charging_problems import changed, charging_problem
 
 CELL = default_cell()
+# A quarter of the plants, half the rounds: a study takes a third of the time, and what is asserted of it has room.
+FEW = TwinSettings(plants=16, judges=32, rounds=3, pool=8)
+# One hour instead of two: a charge whose time counts takes 35 to 50 min.
+HOUR = 360
 
 
 @dataclass(frozen=True)
@@ -68,8 +73,8 @@ def learn(problem, tuner, count):
 
 def test_four_trials_and_none_breaks_the_limit():
     """Nine R0 nodes, resistances wrong by up to half, 2 mV noise; 36.7 min is what 4000 evaluations of CMA-ES reach."""
-    problem = charge()
-    trials, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
+    problem = charge(steps=HOUR)
+    trials, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(), settings=FEW), 4)
     np.testing.assert_allclose(trials[0].theta, problem.space.upper)
     assert max(excess) <= 1.0
     # A tenth is what the step back costs, where one of the plants that judge decides.
@@ -77,8 +82,8 @@ def test_four_trials_and_none_breaks_the_limit():
 
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
-    problem = charge(plant=TwoPairs(CELL))
-    _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety()), 4)
+    problem = charge(plant=TwoPairs(CELL), steps=HOUR)
+    _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(), settings=FEW), 4)
     assert max(excess) <= 5.0
     assert excess[-1] <= 2.0
     assert minutes[-1] < 50.0
@@ -94,13 +99,13 @@ def test_temperature_and_anode_potential_are_kept_while_learning():
     believed = replace(true, anode=Anode((0.0, 0.5, 1.0), (0.26, 0.07, 0.05), (0.016, 0.016, 0.02)))
     problem = charge(
         cell=believed, plant=AnotherCell(true), R0=None, backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3),
-        temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8,
+        temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8, steps=HOUR,
         temperature_backoff=LimitBackoff(-5.0, 5.0), anode_backoff=LimitBackoff(-0.05, 0.05, nodes=4),
     )  # fmt: skip
     loop = ChargingTwin(problem)
     assert set(loop.twin.noise_sd) == {"voltage_V", "temperature_K", "anode_potential_V"}
     assert loop.unpredicted == ()
-    trials, excess, _ = learn(problem, TwinTuner(loop, safety=Safety(start=tuple(problem.space.upper))), 3)
+    trials, excess, _ = learn(problem, TwinTuner(loop, safety=Safety(start=tuple(problem.space.upper)), settings=FEW), 3)
     assert max(excess) <= 5.0
     assert max(t.score.excess["temperature_max_K"] for t in trials) <= 0.5
     assert max(t.score.excess["anode_min_V"] for t in trials) <= 5e-3

@@ -14,7 +14,7 @@ from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.evaluate import evaluate
 from chargetune.battery.plants.electrochemical import CellState, Electrochemical, _built, _signals_after
 from chargetune.episode.episode import Ending
-from chargetune.plants.plant import PlantError
+from chargetune.plants.plant import PlantError, SetUpError
 from chargetune.plants.sensors import Sensors
 from charging_problems import charging_problem
 
@@ -183,7 +183,7 @@ def test_nonsense_is_refused_by_name(changes, said):
 def test_unknown_parameters_are_refused_with_those_there_are(tmp_path):
     with pytest.raises(ValueError, match=r"parameters = 'Okane', allowed are .*OKane2022"):
         _ = replace(SPM, parameters="Okane").capacity_Ah
-    with pytest.raises(FileNotFoundError, match="no such file"):
+    with pytest.raises(ValueError, match="no such file"):
         _ = replace(SPM, parameters=str(tmp_path / "cell.json")).capacity_Ah
 
 
@@ -228,3 +228,28 @@ def test_a_signal_inside_the_solver_is_handled_after_it():
             interrupted(failing=failing)
     assert done == ["went on", "went on"]
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.parametrize(
+    ("name", "model"),
+    [(name, "SPM") for name in ("Prada2013", "ORegan2022", "Mohtat2020", "Marquis2019", "Ai2020")]
+    + [("Chen2020", model) for model in ("SPM", "SPMe", "DFN")],
+)
+def test_sets_without_side_reactions_charge_too(name, model):
+    """At 1C the charge that was counted in is the current times the time; the voltage rises and the anode potential falls."""
+    settings = Electrochemical(model=model, parameters=name)
+    plant, current = settings.plant(0.3, 60.0, Sensors()), np.array([settings.capacity_Ah])
+    rest = plant.reset(0)
+    first, second = plant.step(current), plant.step(current)
+    outputs = [s.name for s in plant.outputs]
+    voltage, soc, temperature, anode = (outputs.index(n) for n in ("voltage_V", "soc", "temperature_K", "anode_potential_V"))
+    assert second.end[soc] == pytest.approx(0.3 + 2 / 60, abs=1e-6)
+    assert rest.end[voltage] < first.end[voltage] < second.end[voltage] < 4.4
+    assert second.end[anode] < rest.end[anode]
+    # The reversible heat of some sets cools at first.
+    assert abs(second.end[temperature] - 298.15) < 5
+
+
+def test_a_set_that_lacks_what_the_model_needs_is_refused_with_the_reason():
+    with pytest.raises(SetUpError, match="parameters = 'ECM_Example' lacks what this model needs"):
+        Electrochemical(parameters="ECM_Example").plant(0.5, 10.0, Sensors()).reset(0)

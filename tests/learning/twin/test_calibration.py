@@ -5,20 +5,21 @@ import pytest
 from scipy.stats import norm
 from toy_loop import NOISE, SPACE, Plant, ToyLoop, structural
 
-from chargetune.learning.twin.calibration import SCALES, PredictionCheck, calibrate_scales, check_prediction
+from chargetune.learning.twin.calibration import SCALES, PredictionCheck, check_prediction, scale_quantile
 from chargetune.learning.twin.ensemble import condition
 from chargetune.learning.twin.settings import TwinSettings
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 STEP = SCALES[1] / SCALES[0]
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.84)
 
 
 def test_before_anything_was_checked_scales_are_quantiles_of_the_prior():
     for sd in (0.3, 0.8):
-        found = calibrate_scales((), sd, 8)
-        np.testing.assert_allclose(found, np.exp(sd * norm.ppf((np.arange(8) + 0.5) / 8)), rtol=STEP - 1)
-    np.testing.assert_allclose(calibrate_scales((), 1e-3, 4), 1.0)
+        found = [scale_quantile((), sd, share) for share in SHARES]
+        np.testing.assert_allclose(found, np.exp(sd * norm.ppf(SHARES)), rtol=STEP - 1)
+    assert scale_quantile((), 1e-3, 0.9) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("true", [0.5, 1.0, 3.0])
@@ -28,8 +29,8 @@ def test_scales_are_quantiles_of_the_closed_form_posterior(true):
     errors = true * np.random.default_rng(3).standard_normal(n)
     likelihood = -0.5 * (n * np.log(SCALES**2) + np.sum(errors**2) / SCALES**2)
     parts = [PredictionCheck(share * likelihood, 0.0) for share in (0.25, 0.75)]
-    found = np.array(calibrate_scales(parts, sd, 5))
-    expected = np.sqrt(np.mean(errors**2)) * np.exp(norm.ppf((np.arange(5) + 0.5) / 5) / np.sqrt(2 * n))
+    found = [scale_quantile(parts, sd, share) for share in SHARES]
+    expected = np.sqrt(np.mean(errors**2)) * np.exp(norm.ppf(SHARES) / np.sqrt(2 * n))
     np.testing.assert_allclose(found, expected, rtol=1.2 * (STEP - 1))
 
 
@@ -38,8 +39,8 @@ def test_a_prior_and_a_likelihood_of_gaussian_shape_multiply():
     likelihood = -0.5 * ((np.log(SCALES) - 1.0) / 0.4) ** 2
     precision = 1 / 0.5**2 + 1 / 0.4**2
     mean, sd = 1.0 / 0.4**2 / precision, precision**-0.5
-    found = calibrate_scales([PredictionCheck(likelihood, 0.0)], 0.5, 6)
-    np.testing.assert_allclose(found, np.exp(mean + sd * norm.ppf((np.arange(6) + 0.5) / 6)), rtol=STEP - 1)
+    found = [scale_quantile([PredictionCheck(likelihood, 0.0)], 0.5, share) for share in SHARES]
+    np.testing.assert_allclose(found, np.exp(mean + sd * norm.ppf(SHARES)), rtol=STEP - 1)
 
 
 def checked(plant, levels, following, floor=1e-3):
@@ -50,7 +51,7 @@ def checked(plant, levels, following, floor=1e-3):
 
 def test_the_scale_grows_with_what_was_not_predicted():
     right, wrong = (checked(plant, (3.0,), 1.6) for plant in (Plant(), Plant(unmodelled=structural)))
-    medians = [calibrate_scales([one], 1.0, 1)[0] for one in (right, wrong)]
+    medians = [scale_quantile([one], 1.0, 0.5) for one in (right, wrong)]
     assert medians[0] < 1.5 < medians[1]
     assert right.standardised_error < 2.0 < wrong.standardised_error
 
@@ -59,14 +60,14 @@ def test_a_repeat_says_nothing_of_elsewhere():
     """A plant that the twin cannot be, the newest theta tried again: it comes out as before, and what is not known stays so."""
     check = checked(Plant(unmodelled=structural), (3.0, 1.6), 1.6)
     assert check.standardised_error < 1.5
-    found = calibrate_scales([check], 1.0, 5)
-    np.testing.assert_allclose(found, calibrate_scales((), 1.0, 5), rtol=0.25)
+    for share in SHARES:
+        assert scale_quantile([check], 1.0, share) == pytest.approx(scale_quantile((), 1.0, share), rel=0.25)
 
 
 def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
     plant = Plant(unmodelled=structural)
     trials = [plant.trial(k, np.full(3, level)) for k, level in enumerate((3.0, 1.6, 1.6, 1.6, 1.6, 1.6))]
-    scales = [calibrate_scales(condition(ToyLoop(), trials[:n]).checks, 1.0, 1)[0] for n in (2, 6)]
+    scales = [scale_quantile(condition(ToyLoop(), trials[:n]).checks, 1.0, 0.5) for n in (2, 6)]
     assert scales[0] > 1.5
     assert scales[1] > 0.7 * scales[0]
 
@@ -87,11 +88,11 @@ def test_the_likelihood_is_largest_at_the_scale_that_errors_were_drawn_with():
     trial = Plant().trial(0, SPACE.upper)
     found = condition(loop, [trial], TwinSettings()).discrepancy
     for true in (0.4, 3.0):
-        plants = found.samples(np.tile(found.posterior.mode, (40, 1)), [true] * 40, range(100, 140))
+        plants = found.samples(np.tile(found.posterior.mode, (40, 1)), true, range(100, 140))
         episodes = loop.simulate([(np.full(3, 1.4), found.posterior.mode, error) for error in plants])
         noise = np.random.default_rng(0)
         for episode in episodes:
             for side in (episode.output_start, episode.output_end):
                 side[:, 1] += NOISE * noise.standard_normal(len(side))
-        (scale,) = calibrate_scales([check_prediction(found, e) for e in episodes], 10.0, 1)
+        scale = scale_quantile([check_prediction(found, e) for e in episodes], 10.0, 0.5)
         assert true / 1.4 < scale < 1.4 * true

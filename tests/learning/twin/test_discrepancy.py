@@ -63,7 +63,7 @@ def test_a_sample_is_surer_where_something_was_measured():
 def test_the_error_of_a_state_does_not_jump_with_the_input():
     ensemble, _ = conditioned((3.0, 2.0), loop=WITH_SWIRL)
     found = ensemble.discrepancy
-    (sample,) = found.samples(found.posterior.mode[None], [1.0], [3])
+    (sample,) = found.samples(found.posterior.mode[None], 1.0, [3])
     tables = dict(zip(found.lookup_table.outputs, (t.reshape(found.lookup_table.counts) for t in sample.table), strict=True))
     steps = {name: np.max(np.abs(np.diff(table, axis=1))) for name, table in tables.items()}
     assert steps["swirl"] < 1e-2 * np.ptp(tables["swirl"])
@@ -126,19 +126,19 @@ def test_samples_have_the_mean_and_the_covariance_of_the_process_of_their_scale(
     weights = found.lookup_table.weights(found.at(WRONG.episode(np.full(3, 1.3), 1)))
     covariance = weights @ (prior - gain @ data.weights @ prior) @ weights.T
     mean = weights @ gain @ found._residuals(mode)[:, 0]
-    drawn = np.array([s.table[0] @ weights.T for s in found.samples(np.tile(mode, (600, 1)), [scale] * 600, range(600))])
+    drawn = np.array([s.table[0] @ weights.T for s in found.samples(np.tile(mode, (600, 1)), scale, range(600))])
     sd = np.sqrt(np.diag(covariance))
     assert np.max(np.abs(drawn.mean(axis=0) - mean) / sd) < 5 / np.sqrt(600)
     np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.25 * sd.max() ** 2)
     np.testing.assert_allclose(np.trace(np.cov(drawn.T)), np.trace(covariance), rtol=0.2)
 
 
-def test_samples_of_several_scales_are_those_of_one_after_the_other():
+def test_samples_of_several_plants_are_those_of_one_after_the_other():
     found = conditioned((3.0, 1.7))[0].discrepancy
     unknowns = found.posterior.draw(4, 0)
-    together = found.samples(unknowns, [1.0, 2.0, 1.0, 0.5], [7, 8, 9, 10])
-    for m, scale, seed, one in zip(unknowns, [1.0, 2.0, 1.0, 0.5], [7, 8, 9, 10], together, strict=True):
-        (alone,) = found.samples(m[None], [scale], [seed])
+    together = found.samples(unknowns, 2.0, [7, 8, 9, 10])
+    for m, seed, one in zip(unknowns, [7, 8, 9, 10], together, strict=True):
+        (alone,) = found.samples(m[None], 2.0, [seed])
         np.testing.assert_allclose(one.table, alone.table, atol=1e-12)
 
 

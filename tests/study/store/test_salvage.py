@@ -16,7 +16,7 @@ from chargetune.study.store.salvage import salvage
 from chargetune.study.store.store import Store, StoreError
 from chargetune.study.warm_start import Earlier
 
-TRIALS = 40
+TRIALS = 16
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ class TestFile:
 
     @pytest.fixture(autouse=True)
     def stray(self, monkeypatch):
-        """Rows are looked for until so many numbers in a row have none; the last row here has the number 82."""
+        """Rows are looked for until so many numbers in a row have none; the last row here has the number 2 TRIALS + 2."""
         monkeypatch.setattr(damaged_reader, "STRAY", 500)
 
     def ruin(self, path, kind):

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.charging.controller import controller_of
-from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.settings import SensorSettings
+from chargetune.battery.charging.problem import ChargingProblem, judged_exactly
 from chargetune.battery.charging.verdict import NotMeasuredError, score_episode
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.validation import check_number
@@ -120,8 +119,7 @@ class Variations:
             return None, episode
         # Judged is the problem as it stands: one that began at the drawn SOC may be a problem that nobody may state, a cell at rest
         # above its limit for one, and is an episode all the same.
-        judge = replace(problem, sensors=SensorSettings(), objective=replace(problem.objective, verdict_samples=1))
         try:
-            return score_episode(judge, episode.noise_free(), soc_start=draw.soc_start), episode
+            return score_episode(judged_exactly(problem), episode.noise_free(), soc_start=draw.soc_start), episode
         except NotMeasuredError:
             return None, episode

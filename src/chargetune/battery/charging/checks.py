@@ -37,7 +37,8 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
     """Everything that is found wrong with a charging problem, the errors first.
 
     ``start`` is a theta that is declared safe. ``quick`` leaves out what takes more than the first charge of a study does
-    anyway: longer horizons, and the first intervals of an electrochemical plant.
+    anyway: longer horizons, and all but the first interval of an electrochemical plant. Raises SetUpError for a plant that cannot be
+    built: no theta could work.
     """
     circuit = stand_in(problem)
     controller, plant = controller_of(circuit), plant_of(circuit)
@@ -62,8 +63,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
         if start is not None:
             found += check_theta(lambda theta: _beyond(circuit, theta), circuit.space, start)
     found += check_ringing(circuit)
-    if not quick:
-        found += _plant_signs(problem)
+    found += _plant_signs(problem, 1 if quick else PROBE_STEPS)
     return tuple(sorted(found, key=lambda finding: finding.severity != "error"))
 
 
@@ -142,12 +142,15 @@ def _voltage_excess(problem: ChargingProblem, theta: NDArray[np.float64]) -> flo
     return max(float(np.max(values)) for values in run_charge(problem, theta).signal("voltage_V", true=True)) - problem.voltage_max_V
 
 
-def _plant_signs(problem: ChargingProblem) -> list[Finding]:
-    """The first intervals of another simulated plant than the circuit; a real one is left alone."""
+def _plant_signs(problem: ChargingProblem, steps: int) -> list[Finding]:
+    """The first intervals of another simulated plant than the circuit; a real one is left alone.
+
+    Raises SetUpError where it cannot be built at all.
+    """
     if problem.plant is None:
         return []
     plant = plant_of(problem)
     if as_steppable(plant) is None:
         return []
-    run: Episode = run_episode(controller_of(problem), plant, steps=PROBE_STEPS)
+    run: Episode = run_episode(controller_of(problem), plant, steps=steps)
     return check_response(controller_of(problem), run)

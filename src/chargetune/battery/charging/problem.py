@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from chargetune.battery.cell.cell import Cell, mismatched
 from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import Limit, LimitSettings
 from chargetune.battery.charging.observers import settings_of
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import (
     ControllerSettings,
     EpisodeSettings,
@@ -21,13 +23,13 @@ from chargetune.battery.charging.settings import (
     SensorSettings,
 )
 from chargetune.battery.charging.tunables import Tunables
-from chargetune.battery.validation import check_number
+from chargetune.battery.validation import check_count, check_number
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
 from chargetune.runtime.cache import built_once
 
-__all__ = ["ChargingProblem", "PlantModel", "stand_in"]
+__all__ = ["ChargingProblem", "PlantModel", "judged_exactly", "stand_in"]
 
 
 class PlantModel(Protocol):
@@ -57,6 +59,7 @@ class ChargingProblem:
     objective: Objective = field(default_factory=Objective)
     theta: Tunables = field(default_factory=Tunables)
     safety: SafetySettings | None = None
+    range: ChargingRangeSettings | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -64,12 +67,15 @@ class ChargingProblem:
         except TypeError as error:
             raise ValueError(f"plant = {self.plant!r}, allowed is data that can be hashed, such as a frozen dataclass: {error}") from error
         if self.objective.charge_time_to_soc is not None:
-            check_number("charge_time_to_soc", self.objective.charge_time_to_soc, self.episode.soc_start, 1.0, "", open_low=True)
+            most = self.episode.soc_target
+            check_number("charge_time_to_soc", self.objective.charge_time_to_soc, self.episode.soc_start, most, "", open_low=True)
+        check_count("verdict_samples", self.objective.verdict_samples, 1, self.episode.steps)
         believed = self.episode.soc_start + self.estimator.soc_start_error
         check_number("believed SOC at the start (soc_start + soc_start_error)", believed, 0.0, 1.0)
         self._check_bounds()
         self._check_theta()
         self._check_physics()
+        self._check_range()
 
     def _check_bounds(self) -> None:
         cell = self.cell
@@ -126,6 +132,18 @@ class ChargingProblem:
             allowed = f"allowed is less than {highest - resting:.3g} V"
             raise ValueError(f"backoff: upper_V = {backoff.upper_V:g} V forbids any charging from soc_start; {allowed}")
 
+    def _check_range(self) -> None:
+        if self.range is None:
+            return
+        if self.range.ambient_K is not None and self.cell.thermal is None:
+            raise ValueError(f"range: ambient_K = {list(self.range.ambient_K)}, allowed only for a cell with a [thermal] table")
+        highest = self.range.soc_start[1] if self.range.soc_start else 0.0
+        wanted = self.objective.charge_time_to_soc or self.episode.soc_target
+        if highest >= wanted:
+            raise ValueError(
+                f"range: soc_start = {list(self.range.soc_start or ())}, allowed is less than the SOC that is charged to, {wanted:g}"
+            )
+
     @property
     def current_max_A(self) -> float:
         """The largest current: the problem's own, else the cell's."""
@@ -141,7 +159,7 @@ class ChargingProblem:
         """The lower voltage limit: the problem's own, else the cell's."""
         return self.limits_by_name["voltage_min_V"].bound
 
-    @property
+    @cached_property
     def limits_by_name(self) -> dict[str, Limit]:
         """Every limit that is set, in the order of the score: voltage_max_V, voltage_min_V, temperature_max_K, anode_min_V."""
         return self.limits.by_name(self.cell)
@@ -182,13 +200,17 @@ def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...])
     return theta.space(nodes, dict(observer))
 
 
+def judged_exactly(problem: ChargingProblem) -> ChargingProblem:
+    """The problem with sensors that have no error, so that each sample of the true outputs is judged by itself."""
+    return replace(problem, sensors=SensorSettings(), objective=replace(problem.objective, verdict_samples=1))
+
+
 def stand_in(problem: ChargingProblem) -> ChargingProblem:
     """The problem on the cell's own circuit with exact sensors: a check runs hundreds of charges and never touches a real plant.
 
     Limits of signals that the circuit does not have are left out.
     """
-    objective = replace(problem.objective, verdict_samples=1)
-    problem = replace(problem, safety=None, sensors=SensorSettings(), objective=objective)
+    problem = replace(judged_exactly(problem), safety=None, range=None)
     if problem.plant is None:
         return problem
     cell, limits = problem.cell, problem.limits

@@ -15,6 +15,14 @@ from chargetune.plants.sensors import Sensors
 __all__ = ["FILTERS", "ControllerSettings", "EpisodeSettings", "EstimatorSettings", "Objective", "SafetySettings", "SensorSettings"]
 
 
+# A sensor that errs by more measures nothing that a charge could be controlled by.
+SENSOR_ERRORS = {
+    ("voltage", "_V"): (0.5, "V (was it given in mV?)"),
+    ("temperature", "_K"): (20.0, "K"),
+    ("soc", ""): (0.5, "(was it given in %?)"),
+}
+
+
 @dataclass(frozen=True)
 class ControllerSettings:
     """The controller and what it wrongly believes; no ``mismatch_seed`` means that it knows the cell.
@@ -120,10 +128,10 @@ class SensorSettings:
     delay_steps: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("voltage_noise_sd_V", "voltage_resolution_V", "temperature_noise_sd_K", "soc_noise_sd"):
-            check_number(name, getattr(self, name), 0.0, math.inf)
-        for name in ("voltage_bias_V", "temperature_bias_K", "soc_bias"):
-            check_number(name, getattr(self, name), -math.inf, math.inf)
+        for quantity, (most, unit) in SENSOR_ERRORS.items():
+            for name in (f"{quantity[0]}_noise_sd{quantity[1]}", f"{quantity[0]}_bias{quantity[1]}"):
+                check_number(name, getattr(self, name), -most if "bias" in name else 0.0, most, unit)
+        check_number("voltage_resolution_V", self.voltage_resolution_V, 0.0, 0.5, "V (was it given in mV?)")
         check_count("delay_steps", self.delay_steps, 0, 100)
 
     @property

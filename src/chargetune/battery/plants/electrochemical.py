@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.validation import check_number
 from chargetune.model.model import Signal
-from chargetune.plants.plant import Measurement, PlantError
+from chargetune.plants.plant import Measurement, PlantError, SetUpError
 from chargetune.plants.sensors import Readout, Sensors
 
 __all__ = ["CellState", "Electrochemical", "ElectrochemicalPlant"]
@@ -48,7 +48,7 @@ OUTPUTS: tuple[tuple[str, Any], ...] = (
 
 @dataclass(frozen=True)
 class Electrochemical:
-    """An electrochemical cell model with one lumped temperature, SEI growth and partially reversible lithium plating.
+    """An electrochemical cell model with one lumped temperature, SEI growth and lithium plating, each where the parameter set has it.
 
     parameters
         Name of a PyBaMM parameter set, or path of a BPX file (``.json``), which has no side reactions.
@@ -234,11 +234,25 @@ def _built(settings: Electrochemical, soc_start: float) -> _Built:
     """The discretised model at rest at ``soc_start``; 0.2 s, after 2 s for the import of pybamm."""
     # PyBaMM would ask on the terminal whether it may report usage.
     os.environ.setdefault("PYBAMM_DISABLE_TELEMETRY", "true")
-    import pybamm
+    try:
+        import pybamm
+    except ImportError as error:
+        raise SetUpError(
+            f"an electrochemical plant needs PyBaMM, which cannot be imported ({error}): pip install chargetune[pybamm]"
+        ) from error
 
     # Warnings that inputs are missing where only the initial state is computed.
     pybamm.set_logging_level("ERROR")
-    values = _parameters(settings)
+    try:
+        return _discretised(settings, soc_start, _parameters(settings))
+    except KeyError as error:
+        lacking = str(error.args[0]).splitlines()[0] if error.args else ""
+        raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r} lacks what this model needs: {lacking}") from error
+
+
+def _discretised(settings: Electrochemical, soc_start: float, values: Any) -> _Built:
+    import pybamm
+
     if settings.resistance_scale > 1.0:
         one_ampere = ElectrochemicalPlant(_without(settings), 0.5, 1.0)
         rest, _, _ = one_ampere.ahead(CellState(None, 0.0), 0.0)
@@ -246,9 +260,10 @@ def _built(settings: Electrochemical, soc_start: float) -> _Built:
         contact = (settings.resistance_scale - 1.0) * float(charged[0] - rest[0])
     else:
         contact = 0.0
-    options = {"thermal": "lumped", "contact resistance": "true"}
-    if not _is_file(settings.parameters):
-        options |= {"SEI": "solvent-diffusion limited", "lithium plating": "partially reversible"}
+    # Without the data of a lumped temperature (Prada2013) the cell stays at its ambient one.
+    options = {"thermal": "lumped" if THERMAL in values else "isothermal", "contact resistance": "true"}
+    # Side reactions change a charge by microvolts and the life of a cell by years: they are there where the set knows them.
+    options |= {name: kind for name, (kind, key) in SIDE_REACTIONS.items() if key in values}
     area = "Total heat transfer coefficient [W.m-2.K-1]"
     values.update(
         {
@@ -277,6 +292,12 @@ def _built(settings: Electrochemical, soc_start: float) -> _Built:
     return _Built(built, simulation.solver, _reader(built), float(inventory * (full - empty)))
 
 
+# Option of PyBaMM, its kind, and the parameter without which that kind cannot be.
+SIDE_REACTIONS = {
+    "SEI": ("solvent-diffusion limited", "SEI solvent diffusivity [m2.s-1]"),
+    "lithium plating": ("partially reversible", "Exchange-current density for stripping [A.m-2]"),
+}
+THERMAL = "Negative current collector thickness [m]"
 _ACTIVE = tuple(f"{side} electrode active material volume fraction" for side in ("Negative", "Positive"))
 
 
@@ -289,20 +310,20 @@ def _is_file(parameters: str) -> bool:
 
 
 def _parameters(settings: Electrochemical) -> Any:
-    """A fresh set of parameter values. Raises ValueError for an unknown name, FileNotFoundError for a missing file."""
+    """A fresh set of parameter values. Raises SetUpError for an unknown name, and for a file that is missing or is none."""
     import pybamm
 
     if _is_file(settings.parameters):
         if not Path(settings.parameters).is_file():
-            raise FileNotFoundError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
+            raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
         try:
             return pybamm.ParameterValues.create_from_bpx(settings.parameters)
         except Exception as error:
             # Its parser raises what pydantic, json and pybamm raise.
-            raise ValueError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
+            raise SetUpError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
     known = sorted(pybamm.parameter_sets.keys())
     if settings.parameters not in known:
-        raise ValueError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")
+        raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")
     return pybamm.ParameterValues(settings.parameters)
 
 

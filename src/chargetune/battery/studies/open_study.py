@@ -4,15 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from chargetune.battery.charging.charging_range import ChargingRange
+from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.battery.studies.study_file import Config, TunerName, TwinTable
+from chargetune.study.evaluation import Evaluate
 from chargetune.study.store.store import Store
 from chargetune.study.study import Proposer, Study
 
-__all__ = ["make_tuner", "open_study"]
+if TYPE_CHECKING:
+    from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
+
+__all__ = ["evaluation_of", "make_tuner", "open_study"]
+
+# Fresh draws of a trial over a range of use: with none of 300 over a limit, at most 1 % are, with confidence 95 %.
+DRAWS = 300
+
+
+def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
+    """What a trial of this tuner is: one charge, or with "range" a theta on `DRAWS` fresh draws of the range of use."""
+    return _over_range(problem) if name == "range" else Evaluation(problem)
+
+
+def _over_range(problem: ChargingProblem) -> RangeEvaluation:
+    if problem.range is None:
+        raise ValueError("tuner = 'range' is given without a table [range], which says what differs between the charges")
+    if problem.plant is not None:
+        raise ValueError("tuner = 'range' is given with [plant], allowed is the cell's own circuit, of which hundreds are drawn")
+    from chargetune import learning
+
+    return learning.RangeEvaluation(ChargingRange(problem), DRAWS)
 
 
 def make_tuner(
@@ -55,6 +80,7 @@ def make_tuner(
         "sobol": lambda s: learning.Sobol(seed=s),
         "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
         "iterative_learning": lambda _: learning.IterativeLearning(twin),
+        "range": lambda s: learning.RangeTuner(_over_range(problem), seed=s),
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)

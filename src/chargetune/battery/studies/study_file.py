@@ -18,6 +18,7 @@ from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import LimitSettings
 from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import (
     FILTERS,
     ControllerSettings,
@@ -35,7 +36,7 @@ __all__ = ["Config", "TunerName", "load_config", "problem_of_document", "read_ta
 
 
 T = TypeVar("T", bound=BaseModel)
-TunerName = Literal["default", "ei", "sobol", "twin", "iterative_learning", "composite"]
+TunerName = Literal["default", "ei", "sobol", "twin", "iterative_learning", "composite", "range"]
 
 
 class _Table(BaseModel):
@@ -95,6 +96,7 @@ class Config(_Table):
     theta: Tunables = Tunables()
     safety: SafetySettings | None = None
     twin: TwinTable | None = None
+    range: ChargingRangeSettings | None = None
 
     def problem(self, folder: Path | None = None, *, cell: Cell | None = None) -> ChargingProblem:
         """The charging problem; a relative cell file is looked for in ``folder``, ``cell`` stands in for the file's.
@@ -112,6 +114,7 @@ class Config(_Table):
             objective=self.objective,
             theta=self.theta,
             safety=self.safety,
+            range=self.range,
         )
 
     def earlier(self, folder: Path | None = None) -> list[Earlier]:
@@ -129,7 +132,7 @@ class Config(_Table):
         # What is not given leaves no entry, that studies of before it resume.
         if self.objective.charge_time_to_soc is None:
             del data["objective"]["charge_time_to_soc"]
-        for name in ("safety", "twin"):
+        for name in ("safety", "twin", "range"):
             if data[name] is None:
                 del data[name]
         settings = self.estimator.settings

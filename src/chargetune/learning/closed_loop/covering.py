@@ -150,9 +150,10 @@ def _closeness(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def _at_bound(controller: Controller, episode: Episode, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Intervals in which every input was at one of its bounds, shape (K,)."""
     count = len(episode)
-    p = ca.repmat(controller.parameters(theta, controller.model.nominal), 1, count)
-    given = (ca.repmat(ca.DM(theta), 1, count), p, episode.estimate.T)
-    lower, upper = (np.array(bound.map(count)(*given)).T for bound in (controller.input_lower, controller.input_upper))
+    signals = ca.DM.zeros(len(controller.given))
+    p = ca.repmat(controller.parameters(theta, controller.model.nominal, signals), 1, count)
+    arguments = (ca.repmat(ca.DM(theta), 1, count), p, episode.estimate.T, ca.repmat(signals, 1, count))
+    lower, upper = (np.array(bound.map(count)(*arguments)).T for bound in (controller.input_lower, controller.input_upper))
     room = AT_BOUND * np.maximum(upper - lower, 1e-12)
     return np.asarray(np.all((episode.input >= upper - room) | (episode.input <= lower + room), axis=1))
 
@@ -180,14 +181,15 @@ def _step(controller: Controller) -> _Rolled:
     received, nominal = ca.SX.sym("received", len(names)), ca.SX.sym("p", model.nominal.size)
     slopes = ca.SX.sym("slopes", nm, d)
     last, u = (ca.SX.sym(n, len(model.inputs)) for n in ("last", "u"))
-    p = controller.parameters(theta, nominal)
+    given = ca.DM.zeros(len(controller.given))
+    p = controller.parameters(theta, nominal, given)
     signals = {name: received[i] for i, name in enumerate(names)}
     estimate, corrected = estimator.correct(model, memory, signals, last, p)
     ahead = ca.SX(estimator.predict(model, estimate, corrected, u, p))
     rows: list[Any] = []
     for end, state in (("start", estimate), ("end", model.f(estimate, u, p))):
         for limit in controller.limits:
-            row = limit.rows(state, u, theta, p, estimate)
+            row = limit.rows(state, u, theta, p, estimate, last, given)
             applies = limit.at in (end, "both")
             rows.append(row if applies else ca.SX.nan(*row.shape))
     every = ca.vertcat(*rows)

@@ -14,7 +14,7 @@ from chargetune.learning.twin.discrepancy import Discrepancy
 from chargetune.learning.twin.residuals import binned_residuals, measured
 from chargetune.learning.twin.rollout import predict
 
-__all__ = ["SCALES", "PredictionCheck", "calibrate_scales", "check_prediction"]
+__all__ = ["SCALES", "PredictionCheck", "check_prediction", "scale_quantile"]
 
 # Scales that are told apart.
 SCALES = np.geomspace(0.1, 10.0, 61)
@@ -29,15 +29,14 @@ class PredictionCheck(NamedTuple):
     """Root mean square error over the sd of noise, unknowns and ``Twin.discrepancy_sd_floor``; several say that the twin is none."""
 
 
-def calibrate_scales(checks: Sequence[PredictionCheck], prior_sd: float, count: int) -> list[float]:
-    """``count`` values of the discrepancy's scale s, at the middle of equal shares of its distribution after these checks.
+def scale_quantile(checks: Sequence[PredictionCheck], prior_sd: float, share: float) -> float:
+    """The discrepancy's scale s that this share of its distribution after these checks does not exceed.
 
     p(s | checks) ~ exp(-ln(s)^2 / (2 prior_sd^2)) prod_k p(check k | s), on `SCALES`.
     """
     log_density = -0.5 * (np.log(SCALES) / prior_sd) ** 2 + sum(one.log_likelihood for one in checks)
     cumulated = np.cumsum(np.exp(log_density - np.max(log_density)))
-    at = (np.arange(count) + 0.5) / count * cumulated[-1]
-    return [float(s) for s in SCALES[np.searchsorted(cumulated, at)]]
+    return float(SCALES[np.searchsorted(cumulated, share * cumulated[-1])])
 
 
 def check_prediction(discrepancy: Discrepancy, episode: Episode) -> PredictionCheck:

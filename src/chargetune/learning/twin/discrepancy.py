@@ -65,18 +65,18 @@ class Discrepancy:
         left = self._residuals(unknowns)
         return DiscrepancySample(self, np.stack([part.gain @ left[:, i] for i, part in enumerate(self.stated)]))
 
-    def samples(self, unknowns: NDArray[np.float64], scales: Sequence[float], seeds: Sequence[int]) -> list[DiscrepancySample]:
-        """A sample for each of several plants, unknowns of shape (plants, d), each with its scale and seed."""
-        levels = sorted(set(scales))
+    def samples(self, unknowns: NDArray[np.float64], scale: float, seeds: Sequence[int]) -> list[DiscrepancySample]:
+        """A sample for each of several plants, unknowns of shape (plants, d), each with its seed."""
         # They are large, and not kept.
-        parts = dict(zip(levels, parallel_map(self._scaled, levels), strict=True))
-        parallel_map(lambda part: part.root, [part for several in parts.values() for part in several])
-        return parallel_map(self._sample, self._residuals(unknowns), [parts[scale] for scale in scales], seeds)
+        parts = self._scaled(scale)
+        parallel_map(lambda part: part.root, parts)
 
-    def _sample(self, left: NDArray[np.float64], parts: Sequence[_Part], seed: int) -> DiscrepancySample:
-        stream = np.random.default_rng(seed)
-        tables = [part.gain @ left[:, i] + part.root @ stream.standard_normal(len(part.gain)) for i, part in enumerate(parts)]
-        return DiscrepancySample(self, np.stack(tables))
+        def sample(left: NDArray[np.float64], seed: int) -> DiscrepancySample:
+            stream = np.random.default_rng(seed)
+            tables = [part.gain @ left[:, i] + part.root @ stream.standard_normal(len(part.gain)) for i, part in enumerate(parts)]
+            return DiscrepancySample(self, np.stack(tables))
+
+        return parallel_map(sample, self._residuals(unknowns), seeds)
 
     @cached_property
     def stated(self) -> tuple[_Part, ...]:

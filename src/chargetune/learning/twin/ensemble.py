@@ -14,7 +14,7 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import Simulate, windows_of
 from chargetune.learning.tuner import TrialLike
-from chargetune.learning.twin.calibration import SCALES, PredictionCheck, calibrate_scales, check_prediction
+from chargetune.learning.twin.calibration import SCALES, PredictionCheck, check_prediction, scale_quantile
 from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
 from chargetune.learning.twin.laplace import fit
 from chargetune.learning.twin.rollout import predict_each
@@ -49,8 +49,8 @@ class Ensemble:
         error = self.checks[-1].standardised_error if len(self.checks) > 1 else 0.0
         if error >= self.settings.standardised_error_max:
             return f"the newest trial was {error:.1f} stated standard deviations from its prediction"
-        scales = calibrate_scales(self.checks, self.settings.scale_sd, 1)
-        return f"its errors are more than {SCALES[-2]:.1f} times as large as stated" if scales[0] >= SCALES[-2] else ""
+        median = scale_quantile(self.checks, self.settings.scale_sd, 0.5)
+        return f"its errors are more than {SCALES[-2]:.1f} times as large as stated" if median >= SCALES[-2] else ""
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
@@ -94,15 +94,15 @@ class Ensemble:
         return mode, self.discrepancy.mean(mode)
 
     def _members(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
-        """Unknowns and discrepancy of so many plants; each has its own scale of the discrepancy."""
+        """Unknowns and discrepancy of so many plants."""
         if (count, seed) not in self._drawn:
             posterior = self.discrepancy.posterior if self.discrepancy else fit(self.loop.twin, (), self.settings)
             draws = posterior.draw(count, seed)
             errors: Sequence[DiscrepancySample | None] = [None] * count
             if self.discrepancy:
                 seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
-                levels = calibrate_scales(self.checks, self.settings.scale_sd, min(count, self.settings.scales))
-                errors = self.discrepancy.samples(draws, [levels[k % len(levels)] for k in range(count)], seeds)
+                scale = scale_quantile(self.checks, self.settings.scale_sd, self.settings.scale_share)
+                errors = self.discrepancy.samples(draws, scale, seeds)
             self._drawn[count, seed] = list(zip(draws, errors, strict=True))
         return self._drawn[count, seed]
 

@@ -24,8 +24,9 @@ class TwinSettings:
         feature is the one along which the plant moves (a state of charge): its scale is short.
     scale_sd
         Prior sd of the logarithm of the discrepancy's scale: before a prediction was checked the stated sd may be wrong by e.
-    scales
-        Values of that scale in one ensemble, at the middle of equal shares of its distribution.
+    scale_share
+        Share of its distribution that the scale of an ensemble is not below: one sd above the middle. A mean over all scales would
+        hide that where the stated sd is wrong, every window of every plant is wrong at once.
     plants
         Members of an ensemble. The standard error of a probability of 0.95 is 0.027.
     judges
@@ -55,7 +56,7 @@ class TwinSettings:
     length_scales: tuple[float, ...] = (0.15, 0.5, 0.5)
     length_scale_sd: float = 0.5
     scale_sd: float = 1.0
-    scales: int = 8
+    scale_share: float = 0.84
     plants: int = 64
     judges: int = 128
     standardised_error_max: float = 3.5
@@ -69,7 +70,7 @@ class TwinSettings:
     steps_back: tuple[float, ...] = (0.8, 0.5, 0.25)
 
     def __post_init__(self) -> None:
-        for name in ("traces", "bins", "refits", "scales", "plants", "judges", "rounds", "iterations", "pool"):
+        for name in ("traces", "bins", "refits", "plants", "judges", "rounds", "iterations", "pool"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is an integer >= 1")
@@ -77,7 +78,7 @@ class TwinSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is a number > 0")
-        for name in ("aim", "proximal"):
+        for name in ("scale_share", "aim", "proximal"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is [0, 1]")

@@ -45,6 +45,9 @@ class TwinSimulator:
 
     def __post_init__(self) -> None:
         plant, model = SimulatedPlant(self.twin.model, self.twin.start), self.twin.model
+        if self.controller.given:
+            told = ", ".join(self.controller.given_names)
+            raise ValueError(f"twin: the controller's given = {told}, allowed is a controller without given signals")
         check_run(plant, self.steps, 0, ())
         signal_indices(self.controller, plant)
         names = (*model.output_names, *model.input_names)
@@ -193,7 +196,8 @@ def _two_sided(limits: Sequence[ScoredLimit]) -> dict[str, tuple[float, float]]:
 
 def _input_ranges(controller: Controller) -> dict[str, tuple[float, float]]:
     """The controller's bounds of its inputs, as they are with theta_0 at the start."""
-    given = controller.theta.default, controller.model.nominal, np.array(controller.start)
-    low, high = (np.asarray(bound(*given), dtype=float).ravel() for bound in (controller.input_lower, controller.input_upper))
+    signals = np.zeros(len(controller.given))
+    arguments = controller.theta.default, controller.model.nominal, np.array(controller.start), signals
+    low, high = (np.asarray(bound(*arguments), dtype=float).ravel() for bound in (controller.input_lower, controller.input_upper))
     names = controller.model.input_names
     return {n: (float(a), float(b)) for n, a, b in zip(names, low, high, strict=True) if a < b and np.isfinite([a, b]).all()}

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.model.model import Model
+from chargetune.runtime.numeric import is_finite
 
 __all__ = ["Twin", "Uncertain"]
 
@@ -37,8 +38,7 @@ class Uncertain:
             raise ValueError(f"twin: kind of {self.name} = {self.kind!r}, allowed is 'factor', 'offset', 'start' or 'bias'")
         for name, low, high in (("sd", 0.0, math.inf), ("smooth", 0.0, 1.0)):
             value = getattr(self, name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value < low or value >= high or (name == "sd" and value == 0):
+            if not is_finite(value) or value < low or value >= high or (name == "sd" and value == 0):
                 raise ValueError(f"twin: {name} of {self.name} = {value!r}, allowed is {'> 0' if name == 'sd' else '[0, 1)'}")
 
     @property

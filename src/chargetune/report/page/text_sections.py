@@ -111,7 +111,9 @@ def limits(view: StudyView) -> str:
         if reading.episode is None:
             damaged.append(reading.message)
         else:
-            checks[reading.trial.number] = recheck(view.problem, reading.episode, reading.trial.score)
+            # The stored excess of a range of use is that of all its plants, the trace is that of one.
+            score = None if view.tuner == "range" else reading.trial.score
+            checks[reading.trial.number] = recheck(view.problem, reading.episode, score)
     parts = []
     for label, trial in (("untuned", view.untuned), (view.tuned_label, view.tuned)):
         if trial is not None and trial.number in checks:

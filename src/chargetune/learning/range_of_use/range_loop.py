@@ -1,0 +1,77 @@
+"""Closed loops of one controller on the plants of a range of use, and the verdict on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.control.controller import Controller
+from chargetune.episode.compiled import CompiledEpisode, compiled_episode
+from chargetune.episode.episode import Ending, Episode
+from chargetune.episode.score import Score
+from chargetune.episode.score_limits import ScoredLimit, limit_samples, score_limits
+from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
+
+__all__ = ["RangeLoop", "SimulatedRange"]
+
+
+class RangeLoop(Protocol):
+    """Draws of a range of use, and closed loops on them that are judged by their true outputs."""
+
+    @property
+    def largest_of(self) -> tuple[str, ...]:
+        """Metrics of which the largest of all plants counts; of the others it is their mean."""
+        ...
+
+    def draw(self, count: int, seed: int) -> Sequence[DrawnPlant]:
+        """So many plants with their episodes; more draws of a seed begin with the same ones."""
+        ...
+
+    def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
+        """The episode of each theta on the plant of the same place, with its true outputs; None where it did not come to its end."""
+        ...
+
+    def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:
+        """The verdict on an episode, without figures for people where ``metrics`` is False; None when it has none."""
+        ...
+
+    def samples(self, episode: Episode) -> Mapping[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        """By limit of the score the excess of every sample, and its window (`episode.score_limits.limit_samples`)."""
+        ...
+
+
+@dataclass(frozen=True)
+class SimulatedRange:
+    """The `RangeLoop` of a controller and a simulated plant with `Variation`s.
+
+    The estimator reads what the drawn sensors measure; the limits are judged by the true outputs, `ScoredLimit` by `ScoredLimit`.
+    """
+
+    controller: Controller
+    range_of_use: RangeOfUse
+    steps: int
+    limits: tuple[ScoredLimit, ...]
+    objective: Callable[[Episode], float]
+    largest_of: tuple[str, ...] = ()
+
+    def draw(self, count: int, seed: int) -> list[DrawnPlant]:
+        return self.range_of_use.draw(count, seed)
+
+    def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
+        episodes = self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
+        return [e.noise_free() if e.ending is Ending.DONE else None for e in episodes]
+
+    def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:
+        return score_limits(episode, self.limits, objective=self.objective).score
+
+    def samples(self, episode: Episode) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int_]]]:
+        return limit_samples(episode, self.limits)
+
+    @cached_property
+    def _loop(self) -> CompiledEpisode:
+        return compiled_episode(self.controller, self.range_of_use.plant, self.steps)

@@ -1,0 +1,103 @@
+"""The verdict on one theta over many plants of a range of use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
+from chargetune.learning.range_of_use.range_loop import RangeLoop
+from chargetune.plants.range_of_use import DrawnPlant
+
+__all__ = ["Aim", "PlantResult", "RangeEvaluation", "objective_over", "run_plants"]
+
+Aim = Literal["mean", "worst"]
+# Episodes that are simulated together: what they recorded has to fit into memory.
+BATCH = 64
+
+
+@dataclass(frozen=True)
+class PlantResult:
+    """One theta on one drawn plant; no score where the episode did not come to its end."""
+
+    plant: DrawnPlant
+    episode: Episode | None
+    score: Score | None
+
+    @property
+    def beyond(self) -> float:
+        """Worst excess less tolerance, in tolerances; inf without a score."""
+        return float("inf") if self.score is None else self.score.worst
+
+
+def run_plants(loop: RangeLoop, theta: NDArray[np.float64], plants: Sequence[DrawnPlant]) -> list[PlantResult]:
+    """This theta on each of these plants."""
+    out = []
+    for first in range(0, len(plants), BATCH):
+        batch = plants[first : first + BATCH]
+        for plant, episode in zip(batch, loop.simulate([theta] * len(batch), batch), strict=True):
+            out.append(PlantResult(plant, episode, None if episode is None else loop.score(episode)))
+    return out
+
+
+def objective_over(aim: Aim, values: Sequence[float]) -> float:
+    """What a theta is worth over plants: their mean, or the worst of them."""
+    return float(np.mean(values) if aim == "mean" else np.min(values))
+
+
+@dataclass(frozen=True)
+class RangeEvaluation:
+    """What a study runs: a trial is one theta on ``plants`` draws that are made of the trial's own seed.
+
+    So no draw that chose a theta judges it. The score's objective is that over the plants, its excesses are the worst of any plant;
+    ``metrics`` hold how many plants broke a limit, of how many, and every figure of
+    the plants as mean, or as largest (`RangeLoop.largest_of`). The trace is that of the plant
+    with the largest excess; all others follow from the seed. A plant whose episode did not come to its end fails the trial.
+    """
+
+    loop: RangeLoop
+    plants: int = 300
+    aim: Aim = "mean"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.plants, bool) or not isinstance(self.plants, int) or self.plants < 1:
+            raise ValueError(f"range evaluation: plants = {self.plants!r}, allowed is an integer >= 1")
+        if self.aim not in ("mean", "worst"):
+            raise ValueError(f"range evaluation: aim = {self.aim!r}, allowed is 'mean' or 'worst'")
+
+    def results(self, theta: NDArray[np.float64], seed: int) -> list[PlantResult]:
+        """Every plant of the trial with this seed."""
+        return run_plants(self.loop, theta, self.loop.draw(self.plants, seed))
+
+    def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode | None, str]:
+        results = self.results(theta, seed)
+        failed = sum(one.score is None for one in results)
+        worst = max(results, key=lambda one: one.beyond)
+        if failed:
+            return None, worst.episode, f"{failed} of {len(results)} plants: their episodes did not come to an end or have no verdict"
+        return self._score(results), worst.episode, "done"
+
+    def _score(self, results: Sequence[PlantResult]) -> Score:
+        scores = [one.score for one in results if one.score is not None]
+        metrics: dict[str, float | None] = {
+            "violating_plants": float(sum(not score.feasible for score in scores)),
+            "plants": float(len(scores)),
+            "objective_worst": min(score.objective for score in scores),
+        }
+        for name in scores[0].metrics:
+            values = [v for score in scores if (v := score.metrics.get(name)) is not None]
+            # A mean over those that got there would praise the theta that leaves the slow ones out.
+            over = max if name in self.loop.largest_of else np.mean
+            metrics[name] = float(over(values)) if len(values) == len(scores) else None
+        return Score(
+            objective=objective_over(self.aim, [score.objective for score in scores]),
+            performance=objective_over(self.aim, [score.performance for score in scores]),
+            excess={name: max(score.excess[name] for score in scores) for name in scores[0].excess},
+            tolerance=dict(scores[0].tolerance),
+            metrics=metrics,
+        )

@@ -1,0 +1,112 @@
+"""The range of use: every plant and every episode that a controller may meet, as draws of a simulated plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from chargetune.plants.simulated import SimulatedPlant
+from chargetune.plants.variation import Variation
+
+__all__ = ["DrawnPlant", "RangeOfUse"]
+
+# Shares of a Sobol sequence are kept off 0 and 1, where a normal quantile is not finite.
+LEAST_SHARE = 1e-6
+
+
+@dataclass(frozen=True)
+class DrawnPlant:
+    """One draw: the plant, the seed of its noise, and the value of each variation by name (one entry, or one an entry)."""
+
+    plant: SimulatedPlant
+    seed: int
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RangeOfUse:
+    """Draws of ``plant``, each with all ``variations`` at once.
+
+    A parameter of a draw is p prod_j (1 + s_j v_j) over the variations j that change it, a start x_0 + sum_j s_j v_j, a sensor's bias
+    b + sum_j s_j v_j; starts are kept within ``start_bounds``. Draws are a scrambled Sobol sequence (Owen, J. Complexity 14 (1998) 466):
+    any number of them covers the range evenly, and each alone has the stated distributions. The same seed gives the same draws, and
+    more of them begin with the same ones, so that thetas are compared on common random numbers.
+
+    Raises ValueError where a variation changes what the plant does not have, or two have one name.
+    """
+
+    plant: SimulatedPlant
+    variations: tuple[Variation, ...]
+    start_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [one.name for one in self.variations]
+        if len(set(names)) < len(names):
+            raise ValueError(f"range: variations are named {names}, allowed are different names")
+        model = self.plant.model
+        allowed = {"parameters": tuple(model.parameter_blocks), "starts": model.state_names, "biases": model.output_names}
+        for one in self.variations:
+            for label, known in allowed.items():
+                unknown = sorted(set(getattr(one, label)) - set(known))
+                if unknown:
+                    raise ValueError(f"range: variation {one.name}: {label} names unknown {unknown}, allowed are {', '.join(known)}")
+        unknown = sorted(set(self.start_bounds) - set(model.state_names))
+        if unknown:
+            raise ValueError(f"range: start_bounds names unknown {unknown}, allowed are {', '.join(model.state_names)}")
+
+    def draw(self, count: int, seed: int, first: int = 0) -> list[DrawnPlant]:
+        """Draws ``first`` to ``first + count - 1`` of this seed."""
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ValueError(f"range: count = {count!r}, allowed is an integer >= 1")
+        shares = self._shares(first + count, seed)[first:]
+        # Noise is drawn anew for each; its seeds have spawn keys that those of a study's trials never have.
+        keys = [np.random.SeedSequence(seed, spawn_key=(2, first + k)) for k in range(count)]
+        seeds = [int(key.generate_state(1, np.uint64)[0]) >> 11 for key in keys]
+        return [self._drawn(share, one) for share, one in zip(shares, seeds, strict=True)]
+
+    def _shares(self, count: int, seed: int) -> NDArray[np.float64]:
+        """Points of the unit cube, shape (count, numbers)."""
+        numbers = sum(self._sizes)
+        if not numbers:
+            return np.zeros((count, 0))
+        # A Sobol sequence is balanced at powers of two; a longer one begins with the shorter.
+        points = qmc.Sobol(numbers, scramble=True, rng=np.random.default_rng([seed, 1])).random_base2(int(np.ceil(np.log2(max(count, 2)))))
+        return np.asarray(np.clip(points[:count], LEAST_SHARE, 1.0 - LEAST_SHARE))
+
+    @cached_property
+    def _sizes(self) -> tuple[int, ...]:
+        """Numbers of each variation."""
+        blocks = self.plant.model.parameter_blocks
+        return tuple(sum(blocks[name] for name in one.parameters) if one.by_entry else 1 for one in self.variations)
+
+    def _drawn(self, shares: NDArray[np.float64], seed: int) -> DrawnPlant:
+        model, sensors = self.plant.model, self.plant.sensors
+        parameters = {name: np.array(values) for name, values in model.parameters}
+        start = {name: float(self.plant.start.get(name, 0.0)) for name in model.state_names}
+        bias, drawn = dict(sensors.bias), {}
+        for one, part in zip(self.variations, np.split(shares, np.cumsum(self._sizes)[:-1]), strict=True):
+            values = one.distribution.at(part)
+            drawn[one.name] = tuple(float(v) for v in values)
+            own = iter(_split(values, one, model.parameter_blocks))
+            for name, sensitivity in one.parameters.items():
+                parameters[name] = parameters[name] * (1.0 + sensitivity * next(own))
+            for name, sensitivity in one.starts.items():
+                start[name] += sensitivity * float(values[0])
+            for name, sensitivity in one.biases.items():
+                bias[name] = bias.get(name, 0.0) + sensitivity * float(values[0])
+        for name, (low, high) in self.start_bounds.items():
+            start[name] = float(np.clip(start[name], low, high))
+        plant = SimulatedPlant(model.with_parameters(**parameters), start, replace(sensors, bias=bias), self.plant.process_noise_sd)
+        return DrawnPlant(plant, seed, drawn)
+
+
+def _split(values: NDArray[np.float64], one: Variation, sizes: Mapping[str, int]) -> Sequence[NDArray[np.float64]]:
+    """The values for each parameter of a variation, in their order."""
+    if not one.by_entry:
+        return [values] * len(one.parameters)
+    return np.split(values, np.cumsum([sizes[name] for name in one.parameters])[:-1])

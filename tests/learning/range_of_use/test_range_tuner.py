@@ -1,0 +1,130 @@
+"""One theta for a range of plants whose best one is known in closed form."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import chargetune as ct
+from chargetune.learning.range_of_use.range_verdict import run_plants
+
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
+STEPS, LIMIT, TOLERANCE = 30, 1.0, 1e-3
+
+
+def heater(gain):
+    """T+ = 0.8 T + 0.2 gain u: at rest T = gain u, and from 0 it never overshoots."""
+    return ct.Model.build(
+        "heater", states=(ct.Signal("T", "K"),), inputs=(ct.Signal("u"),), outputs=(ct.Signal("T", "K"),),
+        parameters={"gain": gain}, sampling_time_s=1.0,
+        equations=lambda x, u, p: ({"T": 0.8 * x["T"] + 0.2 * p["gain"] * u["u"]}, {"T": x["T"]}),
+    )  # fmt: skip
+
+
+SPACE = ct.ParameterSpace((ct.Parameter("power", 0.05, 2.0, default=1.5),))
+# Blind: it heats with theta whatever is measured, so the plant with the largest gain decides.
+BLIND = ct.Controller.build(
+    heater(1.0), SPACE, horizon=1, stage_cost=lambda s: (s.u["u"] - s.theta["power"]) ** 2,
+    input_lower={"u": 0.0}, input_upper={"u": 2.0},
+)  # fmt: skip
+RANGE = ct.RangeOfUse(ct.SimulatedPlant(heater(1.0), {}), (ct.Variation("gain", ct.Uniform(-0.25, 0.25), parameters={"gain": 1.0}),))
+
+
+def heat(episode):
+    return float(np.mean(episode.signal("T")[1]))
+
+
+def loop(tolerance=TOLERANCE, **changes):
+    limits = (ct.ScoredLimit("T", upper=LIMIT, tolerance=tolerance),)
+    return ct.SimulatedRange(changes.get("controller", BLIND), changes.get("range_of_use", RANGE), STEPS, limits, heat)
+
+
+def told(evaluation, tuner, count):
+    trials = []
+    for k in range(count):
+        theta = tuner.ask(SPACE, trials)[0]
+        score, _, _ = evaluation(theta, 100 + k)
+        trials.append(SimpleNamespace(number=k, theta=theta, status="done", score=score, seed=100 + k))
+    return trials
+
+
+def test_the_found_theta_is_the_largest_that_the_worst_plant_allows():
+    """In closed form: the largest gain is 1.25, T never exceeds gain power, so the best power is LIMIT / 1.25."""
+    evaluation = ct.RangeEvaluation(loop(), 200)
+    trials = told(evaluation, ct.RangeTuner(evaluation, seed=0), 3)
+    best = LIMIT / (1.25 * (1 - 0.8**STEPS))
+    assert trials[-1].theta[0] == pytest.approx(best, rel=0.01)
+    assert trials[-1].score.metrics["violating_plants"] == 0
+    assert trials[-1].score.objective == pytest.approx(0.97 * trials[0].score.objective, rel=0.04)
+
+
+def test_a_trial_is_judged_on_draws_that_nothing_was_chosen_on():
+    evaluation = ct.RangeEvaluation(loop(), 40)
+    tuner = ct.RangeTuner(evaluation, seed=0)
+    chosen = {one.values["gain"] for one in loop().draw(tuner.settings.plants, tuner.seed)}
+    judged = {one.plant.values["gain"] for one in evaluation.results(SPACE.default, 100)}
+    assert len(judged) == 40
+    assert not chosen & judged
+
+
+def test_the_score_is_that_of_all_plants_counted_by_hand():
+    evaluation, theta = ct.RangeEvaluation(loop(), 50), np.array([0.9])
+    score, worst, why = evaluation(theta, 7)
+    gains = np.array([1 + one.values["gain"][0] for one in RANGE.draw(50, 7)])
+    levels = gains[:, None] * 0.9 * (1 - 0.8 ** np.arange(1, STEPS + 1))
+    assert why == "done"
+    assert score.objective == pytest.approx(levels.mean(), rel=1e-5)
+    assert score.excess["T"] == pytest.approx(levels.max() - LIMIT, rel=1e-5)
+    assert score.metrics["violating_plants"] == np.sum(levels.max(axis=1) - LIMIT > TOLERANCE)
+    assert score.metrics["objective_worst"] == pytest.approx(levels.mean(axis=1).min(), rel=1e-5)
+    np.testing.assert_allclose(worst.signal("T")[1], levels[np.argmax(levels.max(axis=1))], rtol=1e-5)
+    least, _, _ = ct.RangeEvaluation(loop(), 50, aim="worst")(theta, 7)
+    assert least.objective == pytest.approx(levels.mean(axis=1).min(), rel=1e-5)
+
+
+def test_it_is_a_pure_function_of_its_trials():
+    evaluation = ct.RangeEvaluation(loop(), 20)
+    trials = told(evaluation, ct.RangeTuner(evaluation, seed=1), 2)
+    again, other = ct.RangeTuner(evaluation, seed=1), ct.RangeTuner(evaluation, seed=2)
+    np.testing.assert_array_equal(again.ask(SPACE, trials), ct.RangeTuner(evaluation, seed=1).ask(SPACE, trials))
+    assert again.ask(SPACE, trials, 2).shape == (2, 1)
+    assert not np.array_equal(again.ask(SPACE, []), other.ask(SPACE, []))
+
+
+def test_a_failed_plant_fails_the_trial_and_says_how_many():
+    """The plant with the negative gain leaves the domain of its output, a square root."""
+    model = ct.Model.build(
+        "root", states=(ct.Signal("T"),), inputs=(ct.Signal("u"),), outputs=(ct.Signal("T"),), parameters={"gain": 1.0},
+        sampling_time_s=1.0, equations=lambda x, u, p: ({"T": ca.sqrt(x["T"] + p["gain"] * u["u"])}, {"T": x["T"]}),
+    )  # fmt: skip
+    controller = ct.Controller.build(
+        model, SPACE, horizon=1, stage_cost=lambda s: (s.u["u"] - s.theta["power"]) ** 2, input_lower={"u": 0.0}, input_upper={"u": 2.0}
+    )
+    signs = ct.RangeOfUse(ct.SimulatedPlant(model, {}), (ct.Variation("sign", ct.Choice((0.0, -2.0)), parameters={"gain": 1.0}),))
+    score, _, why = ct.RangeEvaluation(loop(controller=controller, range_of_use=signs), 16)(np.array([1.0]), 0)
+    assert score is None
+    assert why.startswith("8 of 16 plants")
+
+
+def test_run_plants_is_the_same_in_batches_as_one_by_one():
+    plants = RANGE.draw(70, 5)
+    together = run_plants(loop(), np.array([0.7]), plants)
+    for k in (0, 63, 64, 69):
+        (alone,) = run_plants(loop(), np.array([0.7]), [plants[k]])
+        assert alone.score == together[k].score
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ct.RangeEvaluation(loop(), 0), "plants = 0, allowed is an integer >= 1"),
+        (lambda: ct.RangeEvaluation(loop(), 5, aim="median"), "aim = 'median', allowed is 'mean' or 'worst'"),
+        (lambda: ct.RangeSettings(plants=0), "plants = 0"),
+        (lambda: ct.RangeSettings(aim=1.5), r"aim = 1.5, allowed is \[0, 1\]"),
+    ],
+)
+def test_nonsense_is_refused_by_name(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

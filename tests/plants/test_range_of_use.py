@@ -1,0 +1,112 @@
+"""Draws of a range of use, against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm
+
+from chargetune.model.model import Model, Signal
+from chargetune.plants.range_of_use import RangeOfUse
+from chargetune.plants.sensors import Sensors
+from chargetune.plants.simulated import SimulatedPlant
+from chargetune.plants.variation import Choice, LogNormal, Normal, Uniform, Variation
+
+MODEL = Model.build(
+    "two tanks", states=(Signal("a"), Signal("b")), inputs=(Signal("u"),), outputs=(Signal("a"),),
+    parameters={"r": (1.0, 2.0, 3.0), "c": 4.0}, sampling_time_s=1.0,
+    equations=lambda x, u, p: ({"a": x["a"] + u["u"] / p["c"], "b": x["b"] + p["r"][0]}, {"a": x["a"]}),
+)  # fmt: skip
+PLANT = SimulatedPlant(MODEL, {"a": 0.5}, Sensors(noise_sd={"a": 0.1}, bias={"a": 0.25}))
+
+
+def drawn(*variations, count=256, seed=3, **more):
+    return RangeOfUse(PLANT, variations, **more).draw(count, seed)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "cdf"),
+    [
+        (Uniform(-2.0, 3.0), lambda v: (v + 2) / 5),
+        (Normal(1.0, 0.5), norm(1.0, 0.5).cdf),
+        (LogNormal(2.0, 0.3), lambda v: norm.cdf(np.log(v / 2.0) / 0.3)),
+    ],
+)
+def test_draws_have_the_stated_distribution(distribution, cdf):
+    values = [one.values["v"][0] for one in drawn(Variation("v", distribution, parameters={"c": 1.0}))]
+    # A Sobol sequence is far closer to it than random numbers of the same count, whose statistic is about 0.05.
+    assert kstest(values, cdf).statistic < 0.02
+
+
+def test_each_choice_is_as_likely():
+    values = [one.values["v"][0] for one in drawn(Variation("v", Choice((1.0, 5.0)), starts={"b": 1.0}))]
+    assert sorted(set(values)) == [1.0, 5.0]
+    assert values.count(1.0) == 128
+
+
+def test_one_number_changes_what_it_says_by_its_sensitivities():
+    age = Variation("age", Uniform(0.0, 1.0), parameters={"r": 0.5, "c": -0.2})
+    for one in drawn(age, count=5):
+        (a,) = one.values["age"]
+        blocks = dict(one.plant.model.parameters)
+        np.testing.assert_allclose(blocks["r"], np.array([1.0, 2.0, 3.0]) * (1 + 0.5 * a))
+        np.testing.assert_allclose(blocks["c"], 4.0 * (1 - 0.2 * a))
+        assert one.plant.start_state.tolist() == [0.5, 0.0]
+
+
+def test_variations_multiply_and_entries_have_their_own():
+    both = (
+        Variation("make", Uniform(-0.2, 0.2), parameters={"r": 1.0}),
+        Variation("node", Uniform(-0.1, 0.1), parameters={"r": 1.0, "c": 2.0}, by_entry=True),
+    )
+    for one in drawn(*both, count=4):
+        make, nodes = one.values["make"][0], np.array(one.values["node"])
+        assert nodes.shape == (4,)
+        assert len(set(nodes)) == 4
+        blocks = dict(one.plant.model.parameters)
+        np.testing.assert_allclose(blocks["r"], np.array([1.0, 2.0, 3.0]) * (1 + make) * (1 + nodes[:3]))
+        np.testing.assert_allclose(blocks["c"], 4.0 * (1 + 2.0 * nodes[3]))
+
+
+def test_starts_and_biases_are_added_and_kept_within_bounds():
+    shifts = (
+        Variation("filled", Uniform(-1.0, 1.0), starts={"a": 1.0, "b": -2.0}, of="episode"),
+        Variation("sensor", Normal(0.0, 0.01), biases={"a": 1.0}, of="episode"),
+    )
+    plants = drawn(*shifts, start_bounds={"a": (0.0, 1.0)})
+    for one in plants:
+        (v,), (bias,) = one.values["filled"], one.values["sensor"]
+        np.testing.assert_allclose(one.plant.start_state, [np.clip(0.5 + v, 0.0, 1.0), -2.0 * v])
+        assert one.plant.sensors.bias["a"] == pytest.approx(0.25 + bias)
+        assert one.plant.sensors.noise_sd == {"a": 0.1}
+    assert min(one.plant.start_state[0] for one in plants) == 0.0
+
+
+def test_more_draws_begin_with_the_same_ones_and_other_seeds_are_others():
+    one = Variation("v", Uniform(0.0, 1.0), parameters={"c": 1.0})
+    few, many, other = drawn(one, count=5), drawn(one, count=100), drawn(one, count=5, seed=4)
+    assert [d.values for d in few] == [d.values for d in many[:5]]
+    assert [d.seed for d in few] == [d.seed for d in many[:5]]
+    assert len({d.seed for d in many}) == 100
+    assert not {d.values["v"] for d in few} & {d.values["v"] for d in other}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Variation("v", Uniform(0, 1)), "variation v: changes nothing, allowed is at least one of parameters, starts and biases"),
+        (lambda: Uniform(1.0, 0.0), "lower = 1.0, allowed is at most upper = 0.0"),
+        (lambda: Normal(0.0, float("nan")), "sd = nan, allowed is a finite number"),
+        (lambda: LogNormal(0.0, 0.1), "median = 0.0"),
+        (lambda: Choice(()), "allowed is at least one"),
+        (lambda: Variation("v", Uniform(0, 1), starts={"a": 1.0}, by_entry=True), "by_entry = True"),
+        (lambda: Variation("v", Uniform(0, 1), starts={"a": 1.0}, of="day"), "of = 'day', allowed is 'plant' or 'episode'"),
+        (lambda: drawn(Variation("v", Uniform(0, 1), parameters={"q": 1.0})), r"parameters names unknown \['q'\], allowed are r, c"),
+        (lambda: drawn(Variation("v", Uniform(0, 1), starts={"q": 1.0})), r"starts names unknown \['q'\], allowed are a, b"),
+        (lambda: drawn(Variation("v", Uniform(0, 1), biases={"b": 1.0})), r"biases names unknown \['b'\], allowed are a"),
+        (lambda: drawn(*[Variation("v", Uniform(0, 1), starts={"a": 1.0})] * 2), "allowed are different names"),
+        (lambda: drawn(Variation("v", Uniform(0, 1), starts={"a": 1.0}), count=0), "count = 0, allowed is an integer >= 1"),
+        (lambda: drawn(start_bounds={"q": (0, 1)}), r"start_bounds names unknown \['q'\]"),
+    ],
+)
+def test_nonsense_is_refused_by_name(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
