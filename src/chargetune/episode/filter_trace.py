@@ -37,13 +37,16 @@ def filter_trace(controller: Controller, episode: Episode, theta: ArrayLike | No
 
     The measurement at rest before the first interval is not recorded. The estimate after it is: the filter starts from that, with what
     it predicts as measurement, so that it counts neither as rejected nor as lost. ``delay_steps``: how many intervals late samples came.
-    Raises ValueError for a controller with another estimator.
+    Raises ValueError for a controller with another estimator, or with given signals.
     """
     estimator, model = controller.estimator, controller.model
     if not isinstance(estimator, ExtendedKalman):
         raise ValueError(f"estimator = {type(estimator).__name__}, allowed is ExtendedKalman: others leave nothing out")
+    if controller.given:
+        given = ", ".join(controller.given_names)
+        raise ValueError(f"the controller has given signals {given}, allowed is one without: an episode does not hold them")
     count, names = len(episode), estimator.signals(model)
-    p = np.array(controller.parameters(controller.theta_vector(theta), model.nominal)).ravel()
+    p = np.array(controller.parameters(controller.theta_vector(theta), model.nominal, [])).ravel()
     first = episode.estimate[0]
     at_rest = np.array(model.h(first, np.zeros(len(model.inputs)), p)).ravel()
     received = np.empty((count, len(names)))
