@@ -8,8 +8,9 @@ from chargetune.control.estimators import ExactState
 from chargetune.control.ipopt_reference import multiple_shooting
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import Parameter, ParameterSpace
+from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["SLOTS", "SPACE", "controller", "ipopt_solution", "model", "plant_model", "random_point"]
+__all__ = ["SLOTS", "SPACE", "controller", "ipopt_solution", "linear", "model", "plant_model", "random_point"]
 
 SPACE = ParameterSpace((Parameter("t", 0.5, 2.0, 1.0),))
 
@@ -87,6 +88,38 @@ def controller(slot=None, horizon=6, **changes):
         **changes,
     }
     return Controller.build(model(), SPACE, **settings)
+
+
+def linear(nx, nu, limits, seed=0, **changes):
+    """(controller, plant) of a stable linear system with dense random matrices and upper limits on its first states."""
+    draw = np.random.default_rng(seed)
+    a, b = draw.normal(size=(nx, nx)), draw.normal(size=(nx, nu))
+    a *= 0.95 / np.max(np.abs(np.linalg.eigvals(a)))
+    states, inputs = [f"x{i}" for i in range(nx)], [f"u{i}" for i in range(nu)]
+
+    def equations(x, u, p):
+        return dict(zip(states, ca.vertsplit(ca.mtimes(a, x.vector) + ca.mtimes(b, u.vector)), strict=True)), x
+
+    signals = [Signal(name) for name in states]
+    model = Model.build(
+        "linear",
+        states=signals,
+        inputs=[Signal(name) for name in inputs],
+        outputs=signals,
+        parameters={},
+        sampling_time_s=1.0,
+        equations=equations,
+    )
+    settings = {
+        "horizon": 30,
+        "stage_cost": lambda s: ca.sumsqr(s.x.vector - 0.3) + 0.1 * s.theta["t"] * ca.sumsqr(s.u.vector),
+        "terminal_cost": lambda s: 5 * ca.sumsqr(s.x.vector - 0.3),
+        "input_lower": dict.fromkeys(inputs, -0.3),
+        "input_upper": dict.fromkeys(inputs, 0.3),
+        "limits": [SoftLimit(name, upper=0.4, penalty=1e3, scale=0.1) for name in states[:limits]],
+        **changes,
+    }
+    return Controller.build(model, SPACE, **settings), SimulatedPlant(model, dict.fromkeys(states, 0.6))
 
 
 def random_point(problem, seed=0):

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from systems import SPACE, controller, plant_model
+from systems import SPACE, controller, linear, plant_model
 
 from chargetune.control.control_step import act, compiled_act
 from chargetune.control.controller import SoftLimit
 from chargetune.control.estimators import ExtendedKalman
+from chargetune.episode.compiled import simulate
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
 
@@ -29,6 +30,14 @@ def test_another_theta_is_another_controller():
     first, second, again = (run_episode(own, plant, steps=10, theta=[t], control=step).input for t in (0.5, 2.0, 0.5))
     assert np.max(np.abs(first - second)) > 1e-3
     np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.parametrize("change", [{}, {"blocks": (1, 1, 2, 6)}])
+def test_a_problem_written_as_loops_is_compiled_to_the_same_closed_loop(change):
+    own, plant = linear(12, 4, 6, horizon=10, **change)
+    loops = [simulate(own, plant, steps=10, compiled=compiled) for compiled in (True, False)]
+    np.testing.assert_allclose(loops[0].input, loops[1].input, atol=1e-6)
+    assert np.all(loops[0].status == 0)
 
 
 def test_without_a_compiler_it_is_act(monkeypatch):

@@ -15,8 +15,12 @@ GOOD = {"horizon": 5, "stage_cost": lambda s: s.x["position"] ** 2, "input_lower
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"horizon": 0}, ["horizon = 0", "[1, 50]"]),
-        ({"horizon": 51}, ["horizon = 51", "[1, 50]"]),
+        ({"horizon": 0}, ["horizon = 0", "[1, 200]"]),
+        ({"horizon": 201}, ["horizon = 201", "[1, 200]"]),
+        ({"blocks": (1, 2)}, ["blocks = (1, 2)", "add up to horizon = 5"]),
+        ({"blocks": (5, 0)}, ["blocks = (5, 0)", ">= 1", "horizon = 5"]),
+        ({"blocks": (2.0, 3)}, ["blocks = (2.0, 3)", "integers"]),
+        ({"blocks": (True, 4)}, ["blocks = (True, 4)", "integers"]),
         ({"horizon": True}, ["horizon = True"]),
         ({"horizon": 5.0}, ["horizon = 5.0"]),
         ({"iterations_max": 0}, ["iterations_max = 0", ">= 1"]),

@@ -22,8 +22,8 @@ def differences(function, at, step=1e-6):
 
 def coordinates(problem, inputs, rows, derivatives, lower, upper):
     """(g, T, rows of A, lba, uba, span, gamma) of the QP with v = T e and the slacks apart."""
-    gamma = problem.scaling(derivatives, lower, upper)
-    g, columns, lba, uba, span = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma))
+    gamma, near = problem.scaling(derivatives, lower, upper)
+    g, columns, lba, uba, span = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma, near))
     slacks, size = len(problem.controller.limits), problem.size
     return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma)
 
@@ -50,8 +50,8 @@ def test_slacks_stand_against_their_rows_with_the_penalty_as_price():
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    gamma = float(problem.scaling(derivatives, lower, upper))
-    g, columns, *_ = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma))
+    gamma, near = (float(one) for one in problem.scaling(derivatives, lower, upper))
+    g, columns, *_ = (np.array(o) for o in problem.quadratic(inputs, rows, derivatives, lower, upper, gamma, near))
     for j, limit in enumerate(own.limits):
         price = gamma * limit.penalty * limit.scale
         # s = e / sqrt(price) costs price (s + s^2 / 2).
@@ -179,7 +179,7 @@ def test_residual_is_zero_where_ipopt_says_it_is_optimal_and_nowhere_near(seed):
 
     def residual(at, duals):
         _, rows, derivatives = problem.sweep(now, at, q)
-        gamma = problem.scaling(derivatives, lower, upper)
+        gamma, _ = problem.scaling(derivatives, lower, upper)
         return float(problem.residual(at, rows, derivatives, float(gamma) * 0.1 * duals, gamma, lower, upper))
 
     assert residual(best, multipliers) < 1e-5
@@ -196,7 +196,7 @@ def test_residual_sees_a_multiplier_of_an_unused_row():
     now, _, q, lower, upper = random_point(problem)
     inputs, *_ = solver(problem)(now, cold(problem, np.zeros(1)), q)
     _, rows, derivatives = problem.sweep(now, inputs, q)
-    gamma = problem.scaling(derivatives, lower, upper)
+    gamma, _ = problem.scaling(derivatives, lower, upper)
     none, both = np.zeros(2 * own.horizon), np.zeros(2 * own.horizon)
     both[:2] = 0.3
     assert float(problem.residual(inputs, rows, derivatives, none, gamma, lower, upper)) <= KKT_TOLERANCE

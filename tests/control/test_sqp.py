@@ -127,8 +127,8 @@ def test_iteration_limit_is_told():
     assert -100 <= found <= 100
 
 
-@pytest.mark.parametrize("horizon", [1, 50])
-def test_horizons_from_1_to_50(horizon):
+@pytest.mark.parametrize("horizon", [1, 50, 200])
+def test_horizons_from_1_to_200(horizon):
     episode = simulate(controller("l", horizon=horizon), SimulatedPlant(plant_model(), {}), steps=15, compiled=False)
     assert episode.failures == 0
     assert np.all(np.abs(episode.input) <= 0.9)
@@ -228,10 +228,26 @@ def test_the_warm_start_is_the_solution_a_stage_later():
     own = controller("l", horizon=3)
     problem = problem_of(own)
     width, stages = problem.row_width, range(3)
-    inputs = [f"u{i}" for i in stages]
     bounds, slacks = [f"bound{i}" for i in stages], [f"slack{j}" for j in range(len(own.limits))]
     rows = [f"row{i}.{k}" for i in stages for k in range(width)]
-    labels = [*inputs, *slacks, *bounds, *rows, "terminal"]
-    assert len(labels) == cold(problem, np.zeros(1)).size
+    labels = [*slacks, *bounds, *rows, "terminal"]
+    assert problem.size + len(labels) == cold(problem, np.zeros(1)).size
     later = [f"row{min(i + 1, 2)}.{k}" for i in stages for k in range(width)]
-    assert [labels[i] for i in sqp._shift(problem)] == ["u1", "u2", "u2", *slacks, "bound1", "bound2", "bound2", *later, "terminal"]
+    assert [labels[i] for i in sqp._shift(problem)] == [*slacks, "bound1", "bound2", "bound2", *later, "terminal"]
+    now, inputs, q, *_ = random_point(problem)
+    solution, following, *_ = solver(problem)(now, np.concatenate([inputs, cold(problem, np.zeros(1))[problem.size :]]), q)
+    planned = np.array(solution).ravel()
+    np.testing.assert_array_equal(np.array(following).ravel()[:3], planned[[1, 2, 2]])
+
+
+def test_the_warm_start_of_blocks_is_the_plan_an_interval_later():
+    """What is held for 2 and 3 intervals: the mean over the intervals that a block then covers; their bounds stay as they are."""
+    own = controller("l", horizon=6, blocks=(1, 2, 3))
+    problem = problem_of(own)
+    now, inputs, q, *_ = random_point(problem)
+    solution, following, *_ = solver(problem)(now, np.concatenate([inputs, cold(problem, np.zeros(1))[problem.size :]]), q)
+    planned = np.array(solution).ravel()
+    ahead = np.append(np.repeat(planned, (1, 2, 3))[1:], planned[-1])
+    wanted = [ahead[0], np.mean(ahead[1:3]), np.mean(ahead[3:])]
+    np.testing.assert_allclose(np.array(following).ravel()[:3], wanted, rtol=1e-14)
+    assert sqp._shift(problem)[3:6] == [4, 4, 5]

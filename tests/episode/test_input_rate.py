@@ -163,3 +163,20 @@ def test_refused(change, words):
     with pytest.raises(ValueError) as refused:  # noqa: PT011 - the words are what is tested
         own(**change)
     assert all(word in str(refused.value) for word in words), refused.value
+
+
+def test_rates_and_signals_with_inputs_that_are_held():
+    """Blocks of one, one and three intervals: the rate holds from block to block, the bound is that of a block's first interval."""
+    controller = own(
+        blocks=(1, 1, 3),
+        input_rate={"left": 0.15},
+        input_upper={"left": lambda s: s.given["most"], "right": 1.0},
+        given=(Signal("most"),),
+    )
+    given = {"most": np.where(np.arange(STEPS) < 6, 0.2, 0.9)}
+    whole = simulate(controller, PLANT, steps=STEPS, given=given, compiled=False)
+    assert whole.failures == 0
+    np.testing.assert_allclose(whole.input, run_episode(controller, PLANT, steps=STEPS, given=given).input, rtol=0, atol=1e-6)
+    by_ipopt = run_episode(controller, PLANT, steps=STEPS, given=given, control=ipopt_act)
+    np.testing.assert_allclose(whole.input, by_ipopt.input, rtol=0, atol=2e-4)
+    assert np.max(np.abs(np.diff(whole.input[:, 0]))) <= 0.15 + 1e-9

@@ -123,10 +123,10 @@ def check_limits(
 
 def check_longer_horizon(controller: Controller, run: Episode, theta: ArrayLike | None = None, given: Given | None = None) -> list[Finding]:
     """A horizon so short that the perfect model does clearly better, or keeps a limit, with a longer one."""
-    longer = min(HORIZON_MAX, max(4 * controller.horizon, 20))
+    longer = max(controller.horizon, min(HORIZON_MAX, max(4 * controller.horizon, 20)))
     if longer == controller.horizon:
         return []
-    seeing = replace(controller, horizon=longer)
+    seeing = replace(controller, horizon=longer, blocks=())
     far = simulate(seeing, perfect_plant(controller, theta), steps=len(run), theta=theta, compiled=False, given=given)
     near_cost, far_cost = _costs(controller, run, theta, given), _costs(controller, far, theta, given)
     near, better = float(np.sum(near_cost)), float(np.sum(far_cost))

@@ -64,7 +64,7 @@ def control_step(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     estimate, corrected = problem.correct(memory, y, last, q)
     now = ca.vertcat(estimate, *(last[i] for i in problem.controller.carried))
     inputs, following, status, kkt, count = solve(now, warm, q)
-    u, *_ = split(inputs, [nu] * problem.controller.horizon)
+    u, _ = split(inputs, (nu, problem.size - nu))
     ahead = problem.predict(estimate, corrected, u, q)
     return ca.Function("control_step", [memory, y, last, warm, q], [u, ahead, following, status, kkt, count, estimate])
 

@@ -23,7 +23,7 @@ from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Controller", "LimitRows", "SoftLimit", "Stage"]
 
-HORIZON_MAX = 50
+HORIZON_MAX = 200
 Hessian = Literal["gauss_newton", "exact"]
 Solver = Literal["sqp", "ipopt"]
 FirstGuess = Literal["cold", "ipopt"]
@@ -37,9 +37,10 @@ class Controller:
         s.t. x_{i+1} = f(x_i, u_i), x_0 = estimate, input_lower <= u_i <= input_upper, limits on outputs and states
 
     Inputs are bounded hard, everything else softly, so the problem always has a solution. Build one with `Controller.build`.
-    ``setpoint`` is (x_d, u_d), ``start`` the estimator's state before the first measurement,
-    ``input_before`` the input before the first interval, ``fallback`` the input applied when the solver fails, within the
-    input bounds by clipping. ``given`` are signals whose values over the horizon are told at run time (`model.given`).
+    ``blocks`` says for how many intervals each input is held; empty: u_i is free at every interval. ``setpoint`` is (x_d, u_d),
+    ``start`` the estimator's state before the first measurement, ``input_before`` the input before the first interval, ``fallback``
+    the input applied when the solver fails, within the input bounds by clipping. ``given`` are signals whose values over the
+    horizon are told at run time (`model.given`).
 
     ``input_rate`` (inf: none) bounds the change of an input from one interval to the next, hard like the bounds:
 
@@ -72,6 +73,7 @@ class Controller:
     given: tuple[Signal, ...] = ()
     estimator: Estimator = field(default_factory=ExactState)
     iterations_max: int = 20
+    blocks: tuple[int, ...] = ()
     hessian: Hessian = "gauss_newton"
     solver: Solver = "sqp"
     first_guess: FirstGuess = "cold"
@@ -97,6 +99,7 @@ class Controller:
         input_before: Mapping[str, float] | None = None,
         estimator: Estimator | None = None,
         iterations_max: int = 20,
+        blocks: Sequence[int] = (),
         hessian: Hessian | None = None,
         solver: Solver = "sqp",
         first_guess: FirstGuess = "cold",
@@ -105,7 +108,10 @@ class Controller:
 
         ``parameters`` returns the model parameters that theta or a given signal changes, by name; the others keep the
         model's values. ``fallback`` defaults to the lower input bounds. Bounds of inputs and of their rate are numbers or
-        expressions of theta, p, now and given. Raises ValueError naming the field at fault.
+        expressions of theta, p, now and given. ``blocks`` = (1, 1, 2, 4) holds the input for one, one, two and
+        four intervals (move blocking: fewer variables, so a longer horizon for the same work); by default it changes at
+        every interval. Costs and limits count at every interval all the same, bounds at the first one of a block. Source:
+        Cagienard, Grieder, Kerrigan and Morari, Journal of Process Control 17 (2007). Raises ValueError naming the field at fault.
         """
         if not is_integer(horizon) or not 1 <= horizon <= HORIZON_MAX:
             raise ValueError(f"controller: horizon = {horizon!r}, allowed is an integer in [1, {HORIZON_MAX}]")
@@ -119,6 +125,9 @@ class Controller:
                 raise ValueError(f"controller: {label} = {value!r}, allowed is {', '.join(map(str, allowed))}")
         if not is_integer(iterations_max) or iterations_max < 1:
             raise ValueError(f"controller: iterations_max = {iterations_max!r}, allowed is an integer >= 1")
+        held = tuple(blocks)
+        if held and (not all(is_integer(b) and b >= 1 for b in held) or sum(held) != horizon):
+            raise ValueError(f"controller: blocks = {held!r}, allowed are integers >= 1 that add up to horizon = {horizon}")
         named = [signal.name for signal in given]
         if len(set(named)) < len(named):
             raise ValueError(f"controller: given = {named}, allowed are different names")
@@ -156,6 +165,7 @@ class Controller:
             given=tuple(given),
             estimator=estimator or ExactState(),
             iterations_max=int(iterations_max),
+            blocks=tuple(int(length) for length in held),
             solver=solver,
             first_guess=first_guess,
         )
@@ -189,6 +199,11 @@ class Controller:
     @property
     def given_names(self) -> tuple[str, ...]:
         return tuple(signal.name for signal in self.given)
+
+    @property
+    def input_blocks(self) -> tuple[int, ...]:
+        """For how many intervals each input of the plan is held; they add up to the horizon."""
+        return self.blocks or (1,) * self.horizon
 
     @cached_property
     def carried(self) -> tuple[int, ...]:
@@ -227,6 +242,7 @@ class Controller:
             self.theta.dimension,
             self.horizon,
             self.iterations_max,
+            self.input_blocks,
             *names,
             self.model.parameter_blocks,
             self.rated,

@@ -34,9 +34,9 @@ OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Nlp:
-    """The problem for IPOPT: variables (u_0 .. u_{N-1}, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal, u_last, given).
+    """The problem for IPOPT: variables (an input a block, x_1 .. x_N, s), parameters (now, theta, setpoint, p_nominal, u_last, given).
 
-    bounds: (theta, p_nominal, now, u_last, given) -> (lower, upper) over the horizon, shapes (N nu,).
+    bounds: (theta, p_nominal, now, u_last, given) -> (lower, upper) at the start of each block, shapes (blocks nu,).
     """
 
     solver: ca.Function
@@ -53,7 +53,9 @@ def multiple_shooting(controller: Controller) -> Nlp:
     setpoint, nominal = ca.MX.sym("setpoint", nx + nu), ca.MX.sym("p", model.nominal.size)
     last, given = ca.MX.sym("u_last", nu), ca.MX.sym("given", ng * (horizon + 2))
     _, *signals = split(given, [ng] * (horizon + 2))
-    inputs, states = ca.MX.sym("U", nu, horizon), ca.MX.sym("X", nx, horizon)
+    blocks = controller.input_blocks
+    inputs, states = ca.MX.sym("U", nu, len(blocks)), ca.MX.sym("X", nx, horizon)
+    block_of = [k for k, length in enumerate(blocks) for _ in range(length)]
     slack = ca.MX.sym("s", len(controller.limits))
     cost: Any = ca.MX(0.0)
     gaps: list[Any] = []
@@ -66,7 +68,7 @@ def multiple_shooting(controller: Controller) -> Nlp:
 
     x, before = now, last
     for i in range(horizon):
-        u, p = inputs[:, i], controller.parameters(theta, nominal, signals[i])
+        u, p = inputs[:, block_of[i]], controller.parameters(theta, nominal, signals[i])
         cost += controller.stage_cost(x, u, theta, p, setpoint, now, before, signals[i])
         add_rows(("start", "both"), i, x, u, theta, p, now, before, signals[i])
         gaps.append(states[:, i] - model.f(x, u, p))
@@ -77,7 +79,8 @@ def multiple_shooting(controller: Controller) -> Nlp:
             most, least = ca.fmax(before[j] + rate[j], low[j]), ca.fmin(before[j] - rate[j], high[j])
             rows += [u[j] - most, least - u[j]] if i else []
             low[j], high[j] = (low[j], high[j]) if i else (ca.fmax(low[j], least), ca.fmin(high[j], most))
-        bounds.append((low, high))
+        if i == 0 or block_of[i] > block_of[i - 1]:
+            bounds.append((low, high))
         before = u
     no_input, p = ca.MX(ca.DM.zeros(nu)), controller.parameters(theta, nominal, signals[horizon])
     cost += controller.terminal_cost(x, no_input, theta, p, setpoint, now, before, signals[horizon])
@@ -113,25 +116,26 @@ def ipopt_act(
     status = SolveStatus.CONVERGED if good else SolveStatus.NOT_CONVERGED
     if not np.all(np.isfinite(plan)):
         known = problem.first(np.where(np.isfinite(now), now, 0.0), last)
-        declared = np.tile(np.array(problem.fallback(known, q)).ravel(), controller.horizon)
+        declared = np.tile(np.array(problem.fallback(known, q)).ravel(), len(controller.input_blocks))
         plan, status = np.array(problem.clip(known, declared, q)).ravel(), SolveStatus.FALLBACK
     nu = len(controller.model.inputs)
     u = plan[:nu]
     ahead = np.array(problem.predict(now, corrected, u, q)).ravel()
-    following = np.concatenate([plan[nu:], plan[-nu:], memory.warm[plan.size :]])
+    following = np.concatenate([*problem.layout.later(list(plan.reshape(-1, nu))), memory.warm[plan.size :]])
     return u, Memory(ahead, u, following), Info(status, 0.0 if good else np.inf, _iterations(controller), now)
 
 
 def ipopt_plan(
     controller: Controller, now: NDArray[np.float64], theta: NDArray[np.float64], memory: Memory, given: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], bool]:
-    """(the inputs over the horizon from state ``now``, shape (N nu,), whether IPOPT reports success); NaN where it has no numbers.
+    """(the inputs over the horizon from state ``now``, shape (size,), whether IPOPT reports success); NaN where it has no numbers.
 
     It starts from the plan that ``memory`` holds.
     """
     nlp = _nlp(controller)
     horizon, nominal = controller.horizon, controller.model.nominal
-    nx, size, slacks = len(controller.model.states), horizon * len(controller.model.inputs), len(controller.limits)
+    nx, slacks = len(controller.model.states), len(controller.limits)
+    size = len(controller.input_blocks) * len(controller.model.inputs)
     signals = np.zeros(len(controller.given) * (horizon + 2)) if given is None else given
     arguments = (theta, nominal, np.where(np.isfinite(now), now, 0.0), memory.last_input, signals)
     lower, upper = (np.array(bound).ravel() for bound in nlp.bounds(*arguments))
@@ -165,7 +169,8 @@ def _roll_out(
     controller: Controller, now: NDArray[np.float64], inputs: NDArray[np.float64], theta: NDArray[np.float64], given: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     x, out, horizon = now, [], controller.horizon
-    for u, signals in zip(inputs.reshape(horizon, -1), given.reshape(horizon + 2, -1)[1:], strict=False):
+    every = np.repeat(inputs.reshape(len(controller.input_blocks), -1), controller.input_blocks, axis=0)
+    for u, signals in zip(every, given.reshape(horizon + 2, -1)[1:], strict=False):
         p = controller.parameters(theta, controller.model.nominal, signals)
         x = np.array(controller.model.f(x, u, p)).ravel()
         out.append(x)

@@ -13,6 +13,7 @@ the QP solver reports: one that is silently wrong cannot pass.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 import casadi as ca
@@ -78,18 +79,19 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     cost, rows, derivatives = problem.sweep(now, start, q)
     found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), dual_before, lower, upper, q)
     usable = finite(ca.sum1(ca.fabs(found)))
-    declared = ca.repmat(problem.fallback(known, q), problem.controller.horizon, 1)
+    declared = ca.repmat(problem.fallback(known, q), len(problem.layout.blocks), 1)
     bounded = problem.clip(known, ca.if_else(usable, found, declared), q)
     status = ca.if_else(usable, ca.if_else(kkt <= KKT_TOLERANCE, SolveStatus.CONVERGED, SolveStatus.NOT_CONVERGED), SolveStatus.FALLBACK)
     usable_dual = ca.if_else(finite(ca.sum1(ca.fabs(dual))), dual, ca.DM.zeros(duals))
-    following = ca.vertcat(bounded, usable_dual)[_shift(problem)]
+    held = split(bounded, [problem.layout.nu] * len(problem.layout.blocks))
+    following = ca.vertcat(*problem.layout.later(held), usable_dual[_shift(problem)])
     names = ["U", "warm_next", "status", "kkt", "iterations"]
     return ca.Function("solver", [now, warm, q], [bounded, following, status, kkt, count], ["now", "warm", "q"], names)
 
 
 def cold(problem: Problem, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The first ``warm`` of `solver`: one input vector, shape (nu,), repeated over the horizon, nothing active."""
-    return np.concatenate([np.tile(inputs, problem.controller.horizon), np.zeros(_duals(problem))])
+    """The first ``warm`` of `solver`: one input vector, shape (nu,), in each block, nothing active."""
+    return np.concatenate([np.tile(inputs, len(problem.layout.blocks)), np.zeros(_duals(problem))])
 
 
 def _duals(problem: Problem) -> int:
@@ -97,16 +99,17 @@ def _duals(problem: Problem) -> int:
 
 
 def _shift(problem: Problem) -> list[int]:
-    """Where each entry of the next ``warm`` stands in this one: a stage later, the last stage repeated."""
-    nu, horizon, size = len(problem.controller.model.inputs), problem.controller.horizon, problem.size
-    bounds, width = size + len(problem.controller.limits), problem.row_width
+    """Where each of the next multipliers stands in these: an interval later, the last one repeated; a block of several keeps its own."""
+    layout, bounds = problem.layout, len(problem.controller.limits)
+    first_row, width = bounds + layout.size, len(layout.stage_groups)
 
-    def later(offset: int, block: int) -> list[int]:
-        return [offset + min(i + 1, horizon - 1) * block + k for i in range(horizon) for k in range(block)]
+    def later(offset: int, size: int, lengths: Sequence[int]) -> list[int]:
+        last = len(lengths) - 1
+        return [offset + min(i + (length == 1), last) * size + k for i, length in enumerate(lengths) for k in range(size)]
 
-    first_row = bounds + size
-    terminal = range(first_row + horizon * width, first_row + len(problem.groups))
-    return [*later(0, nu), *range(size, bounds), *later(bounds, nu), *later(first_row, width), *terminal]
+    terminal = range(first_row + layout.horizon * width, first_row + len(layout.groups))
+    rows = later(first_row, width, (1,) * layout.horizon)
+    return [*range(bounds), *later(bounds, layout.nu, layout.blocks), *rows, *terminal]
 
 
 def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
@@ -131,10 +134,10 @@ def _iteration(problem: Problem, qp: QPSolver) -> ca.Function:
     bent = curvature(bend, now, inputs, derivatives, prices, q)
     if problem.controller.hessian == "exact":
         bent = problem.convex(bent, lower, upper)
-        gamma = problem.scaling(bent, lower, upper)
+        gamma, near = problem.scaling(bent, lower, upper)
     else:
-        gamma = problem.scaling(derivatives, lower, upper)
-    *data, span = problem.quadratic(inputs, c, bent, lower, upper, gamma)
+        gamma, near = problem.scaling(derivatives, lower, upper)
+    *data, span = problem.quadratic(inputs, c, bent, lower, upper, gamma, near)
     values, new_dual = qp(len(limits), problem.size, problem.size + rows)(*data, dual)
     # What phi may rise by is below the solver's tolerance in the scaled cost, and above the rounding of the penalties.
     rounding = MERIT_ROUNDING * sum(limit.penalty * limit.scale for limit in limits)
