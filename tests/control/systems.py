@@ -127,7 +127,7 @@ def random_point(problem, seed=0):
     rng = np.random.default_rng(seed)
     own = problem.controller
     q = problem.prepare(own.theta.default, ca.DM(own.setpoint), own.model.nominal)
-    now = rng.normal(0, 0.4, len(own.model.states))
+    now = problem.first(rng.normal(0, 0.4, len(own.model.states)), own.input_before)
     lower, upper = (np.array(b).ravel() for b in problem.bounds(now, q))
     return now, rng.uniform(lower, upper), q, lower, upper
 
