@@ -124,3 +124,15 @@ def _compiled_code(request, monkeypatch):
 def virtual_machine(monkeypatch):
     """Problems that run a few times are not worth a compilation, which takes as long as a hundred charges."""
     monkeypatch.setenv("CHARGETUNE_CC", "none")
+
+
+@pytest.fixture(params=["straight-line code", "loops"])
+def written_as(request, monkeypatch):
+    """Small problems in both forms that a problem may have; what other tests built does not serve here, and the other way round."""
+    from chargetune.control import ocp
+    from chargetune.runtime import cache
+
+    monkeypatch.setattr(cache, "_BUILT", cache.Built(32))
+    if request.param == "loops":
+        monkeypatch.setattr(ocp, "STRAIGHT_MAX", 0)
+    return request.param

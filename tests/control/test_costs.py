@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from chargetune.control.control_step import act, begin
 from chargetune.control.controller import Controller, SoftLimit
 from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.episode.compiled import compiled_episode, simulate
@@ -101,12 +102,15 @@ def reactor():
     )
 
 
-def test_economic_cost_of_a_nonlinear_plant_is_solved_as_by_ipopt():
+@pytest.mark.parametrize("blocks", [(), (1, 1, 2, 4)])
+@pytest.mark.usefixtures("written_as")
+def test_economic_cost_of_a_nonlinear_plant_is_solved_as_by_ipopt(blocks):
     """Its curvature is that of the dynamics alone: Gauss-Newton has none of it."""
     own = Controller.build(
         reactor(),
         NONE,
         horizon=8,
+        blocks=blocks,
         stage_cost=lambda s: -s.x["b"] + 0.3 * s.u["feed"],
         terminal_cost=lambda s: -5 * s.x["b"],
         input_lower={"feed": 0.0, "jacket": -1.0},
@@ -263,13 +267,32 @@ def test_equality_at_the_end_of_the_horizon(compiled):
         two = run_episode(own, plant, steps=6, control=ipopt_act)
         np.testing.assert_allclose(one.input, two.input, rtol=0, atol=0.02)
         # The plan of the last interval, rolled out.
-        from chargetune.control.control_step import act, begin
-
         u, memory, _ = act(own, np.array([0.0, 0.1, 0.0, 0.0]), np.zeros(0), begin(own))
         x = np.array([0.0, 0.1, 0.0, 0.0])
         for value in [u[0], *memory.warm[:9]]:
             x = np.array(own.model.f(x, value, [])).ravel()
         np.testing.assert_allclose(x[[0, 2]], [0.2, 0.0], rtol=0, atol=1e-3)
+
+
+def test_equality_at_the_end_of_the_horizon_with_inputs_that_are_held():
+    """x+ = 0.9 x + u with u_0, then u_1 for two intervals, is led from 2 to 0.5 at the end of the third."""
+    own = Controller.build(
+        tank(),
+        NONE,
+        horizon=3,
+        blocks=(1, 2),
+        stage_cost=lambda s: s.u["u"] ** 2,
+        input_lower={"u": -1.0},
+        input_upper={"u": 1.0},
+        limits=[SoftLimit("x", equals=0.5, at="terminal", penalty=1e4, scale=0.01)],
+    )
+    u, memory, info = act(own, np.array([2.0]), np.zeros(0), begin(own))
+    assert info.status == 0
+    # The least of u_0^2 + 2 u_1^2 subject to 0.9^3 2 + 0.81 u_0 + 1.9 u_1 = 0.5.
+    price = (0.5 - 0.9**3 * 2) / (0.81**2 + 1.9**2 / 2)
+    np.testing.assert_allclose(u, [0.81 * price], atol=1e-4)
+    # What is planned an interval later: u_1 for good.
+    np.testing.assert_allclose(memory.warm[:2], [1.9 / 2 * price] * 2, atol=1e-4)
 
 
 def test_equality_beside_a_bound_is_refused():

@@ -28,9 +28,16 @@ def coordinates(problem, inputs, rows, derivatives, lower, upper):
     return g[slacks:, 0], columns[slacks:, :size].T, columns[slacks:, size:].T, lba.ravel(), uba.ravel(), span.ravel(), float(gamma)
 
 
-@pytest.mark.parametrize("slot", ["l", "X", "E"])
-def test_condensed_gradient_and_jacobian_are_those_of_finite_differences(slot):
-    problem = problem_of(controller(slot))
+HELD = {
+    "blocks": (1, 2, 3),
+    "input_rate": {"force": 0.1},
+    "stage_cost": lambda s: (s.x["position"] - 1) ** 2 + 0.1 * s.u["force"] ** 2 + 0.3 * (s.u["force"] - s.u_last["force"]) ** 2,
+}
+
+
+@pytest.mark.parametrize(("slot", "change"), [("l", {}), ("X", {}), ("E", {}), ("E", {"blocks": (1, 2, 3)}), ("X", HELD)])
+def test_condensed_gradient_and_jacobian_are_those_of_finite_differences(slot, change):
+    problem = problem_of(controller(slot, **change))
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
     gradient, transform, jacobian, lba, uba, span, gamma = coordinates(problem, inputs, rows, derivatives, lower, upper)
@@ -108,9 +115,10 @@ def test_curvature_is_that_of_the_lagrangian_in_each_input():
     assert np.all(found >= -1e-6)
 
 
-def test_exact_hessian_is_that_of_the_lagrangian():
+@pytest.mark.parametrize("blocks", [(), (1, 2, 3)])
+def test_exact_hessian_is_that_of_the_lagrangian(blocks):
     """With inputs that push outwards it is positive definite, and nothing of it is changed."""
-    own = controller("Y", limits=[SoftLimit("load", upper=0.6, at="end")], hessian="exact")
+    own = controller("Y", limits=[SoftLimit("load", upper=0.6, at="end")], hessian="exact", blocks=blocks)
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
     _, rows, derivatives = problem.sweep(now, inputs, q)
@@ -123,8 +131,10 @@ def test_exact_hessian_is_that_of_the_lagrangian():
     assert np.max(np.abs(straight - wanted)) > 0.01 * np.max(np.abs(wanted))
 
 
-def test_a_hessian_that_is_bent_downwards_is_turned_upwards():
-    own = controller("Y", stage_cost=lambda s: -(s.u["force"] ** 2) + 0.1 * s.x["position"] ** 2, terminal_cost=lambda s: 0.0, limits=[])
+@pytest.mark.parametrize("blocks", [(), (1, 2, 3)])
+def test_a_hessian_that_is_bent_downwards_is_turned_upwards(blocks):
+    cost = {"stage_cost": lambda s: -(s.u["force"] ** 2) + 0.1 * s.x["position"] ** 2, "terminal_cost": lambda s: 0.0}
+    own = controller("Y", **cost, limits=[], blocks=blocks)
     assert own.hessian == "exact"
     problem = problem_of(own)
     now, inputs, q, lower, upper = random_point(problem)
@@ -203,8 +213,9 @@ def test_residual_sees_a_multiplier_of_an_unused_row():
     assert float(problem.residual(inputs, rows, derivatives, both, gamma, lower, upper)) == pytest.approx(0.3)
 
 
-def test_merit_refuses_a_point_where_a_row_is_no_number():
-    problem = problem_of(controller("l"))
+@pytest.mark.parametrize("change", [{}, {"limits": [], "input_rate": {"force": 0.1}}])
+def test_merit_refuses_a_point_where_a_row_is_no_number(change):
+    problem = problem_of(controller("l", **change))
     rows = np.full(len(problem.groups), -1.0)
     assert float(problem.merit(2.0, rows)) == 2.0
     rows[3] = np.nan

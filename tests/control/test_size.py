@@ -28,8 +28,18 @@ def test_twelve_states_four_inputs_thirty_intervals_are_as_ipopt_says():
     assert np.any(ours.true_end[:, :6] > 0.399)
 
 
+CHANGES = (
+    {},
+    {"blocks": (1, 2, 3, 5)},
+    {"limits": []},
+    {"hessian": "exact"},
+    {"input_rate": {"force": 0.1}},
+    {"hessian": "exact", "input_rate": {"force": 0.1}, "blocks": (1, 2, 3, 5)},
+)
+
+
 @pytest.mark.parametrize("stage_max", [1500, 60, 0])
-@pytest.mark.parametrize("change", [{}, {"blocks": (1, 2, 3, 5)}, {"limits": []}, {"hessian": "exact"}, {"input_rate": {"force": 0.1}}])
+@pytest.mark.parametrize("change", CHANGES)
 def test_loops_and_straight_line_code_are_the_same_functions(monkeypatch, change, stage_max):
     """Chunks of sensitivities: all at once, several of straight-line code, several of loops."""
     own = controller("E", **{"horizon": 11, **change})
@@ -52,6 +62,15 @@ def test_loops_and_straight_line_code_are_the_same_functions(monkeypatch, change
     }.items():
         for one, other in zip(*(getattr(problem, name).call([ca.DM(g) for g in given]) for problem in (straight, loops)), strict=True):
             np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize(("blocks", "written_out"), [((), True), ((40,), True), ((60, 60, 80), False)])
+def test_long_blocks_are_no_small_problem(blocks, written_out):
+    """Few variables, but a product of matrices an interval: what is written out as straight-line code stays small."""
+    own, _ = linear(3 if written_out else 12, 1, 1, horizon=sum(blocks) or 20, blocks=blocks)
+    quadratic = control_problem(own).quadratic
+    assert quadratic.class_name() == ("SXFunction" if written_out else "MXFunction")
+    assert quadratic.n_instructions() < 5 * ocp.STRAIGHT_MAX
 
 
 PLANT = SimulatedPlant(plant_model(), {"position": -0.2, "speed": 0.1})

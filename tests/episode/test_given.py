@@ -80,9 +80,11 @@ def test_episode_is_that_of_step_by_step(heating, plant, compiled):
     assert whole.failures == 0
 
 
-def test_episode_is_that_of_ipopt(heating, plant):
-    one = run_episode(heating(), plant, steps=STEPS, given=TOLD)
-    two = run_episode(heating(), plant, steps=STEPS, given=TOLD, control=ipopt_act)
+@pytest.mark.parametrize("blocks", [(), (1, 2, 3)])
+@pytest.mark.usefixtures("written_as")
+def test_episode_is_that_of_ipopt(heating, plant, blocks):
+    one = run_episode(heating(blocks=blocks), plant, steps=STEPS, given=TOLD)
+    two = run_episode(heating(blocks=blocks), plant, steps=STEPS, given=TOLD, control=ipopt_act)
     np.testing.assert_allclose(one.input, two.input, rtol=0, atol=1e-4)
     # The limit is previewed, and so it is kept from the instant on at which it rises.
     assert np.all(one.state[1:STEPS, 0] >= TOLD["least"][1:] - 1e-3)

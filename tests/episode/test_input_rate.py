@@ -79,6 +79,20 @@ def test_whole_episode_is_that_of_step_by_step_and_of_ipopt(case, compiled):
         np.testing.assert_allclose(whole.input, by_ipopt.input, rtol=0, atol=2e-4)
 
 
+@pytest.mark.usefixtures("written_as")
+@pytest.mark.parametrize("case", CASES)
+def test_inputs_that_are_held_are_those_of_ipopt(case):
+    """As straight-line code and as loops."""
+    controller, given = own(**CASES[case], blocks=(1, 1, 3)), TOLD.get(case)
+    ours = run_episode(controller, PLANT, steps=STEPS, given=given)
+    assert ours.failures == 0
+    np.testing.assert_allclose(
+        ours.input, run_episode(controller, PLANT, steps=STEPS, given=given, control=ipopt_act).input, rtol=0, atol=2e-4
+    )
+    free = run_episode(own(**CASES[case]), PLANT, steps=STEPS, given=given)
+    assert np.max(np.abs(free.input - ours.input)) > 1e-3
+
+
 def test_rate_is_kept_from_the_first_interval_on():
     controller = own(input_rate={"left": 0.15, "right": 0.1}, input_before={"left": 0.3})
     episode = simulate(controller, PLANT, steps=STEPS, compiled=False)

@@ -119,12 +119,14 @@ def scaling(layout: Layout, stage: Linearisation, final: Linearisation) -> ca.Fu
     return ca.Function("scaling", [vector, lower, upper], [gamma, near])
 
 
-def convex(layout: Layout, stage: Linearisation, final: Linearisation) -> ca.Function:
+def convex(layout: Layout, stage: Linearisation, final: Linearisation, *, exact: bool) -> ca.Function:
     """(D, lower, upper) -> D as it is where the whole Hessian is positive definite, else with one nearby in every stage.
 
-    The Riccati recursion has positive pivots where it is.
+    The Riccati recursion has positive pivots where it is. Hessians that are not ``exact`` stay as they are.
     """
     vector, lower, upper, blocks, last, ranges = _from_the_end(layout, stage, final)
+    if not exact:
+        return ca.Function("convex", [vector, lower, upper], [vector])
     pivots = cache(_pivots)
     weight, smallest, largest = ca.densify(final.unpack(last)[6]), ca.MX(np.inf), ca.MX(0.0)
     for scale, (of, own) in zip(reversed(ranges), reversed(blocks), strict=True):
@@ -152,24 +154,34 @@ def _from_the_end(layout: Layout, stage: Linearisation, final: Linearisation) ->
 
 def operations(layout: Layout, stage: Linearisation) -> int:
     """About how many multiplications `quadratic` makes."""
-    count = len(layout.blocks)
-    return count * _backward_operations(stage) + count * (count + 1) // 2 * layout.nu * _column_operations(stage)
+    total = 0
+    for i, length in enumerate(layout.blocks):
+        of = _form(stage, length)
+        composing = length * _composing_operations(stage) if length > 1 else 0
+        total += composing + _backward_operations(of) + (i + 1) * layout.nu * _column_operations(of)
+    return total
 
 
-def _backward_operations(stage: Linearisation) -> int:
+def _composing_operations(stage: Linearisation) -> int:
     nx, nu, _ = stage.shape
-    f_x, f_u, *_ = (pattern.nnz() for pattern in stage.patterns)
+    f_x, _, c_x, _, _, _, l_xx, l_ux, _ = (pattern.nnz() for pattern in stage.patterns)
+    return (f_x + c_x + l_xx + l_ux) * (nx + nu) + nx * nx * (nx + nu) + nx * nu * nu
+
+
+def _backward_operations(of: Linearisation) -> int:
+    nx, nu, _ = of.shape
+    f_x, f_u, *_ = (pattern.nnz() for pattern in of.patterns)
     return 4 * f_x * nx + 3 * f_u * nx + 2 * nx * nu * nu
 
 
-def _column_operations(stage: Linearisation) -> int:
-    nx, nu, _ = stage.shape
-    return sum(pattern.nnz() for pattern in stage.patterns[:4]) + nx * nu + nu * nu
+def _column_operations(of: Linearisation) -> int:
+    nx, nu, _ = of.shape
+    return sum(pattern.nnz() for pattern in of.patterns[:4]) + nx * nu + nu * nu
 
 
 def _chunk(layout: Layout, stage: Linearisation) -> int:
     """Blocks of columns that `_forward` moves on at once."""
-    short = STAGE_MAX // (layout.nu * _column_operations(stage) * max(layout.blocks))
+    short = STAGE_MAX // (layout.nu * _column_operations(_form(stage, max(layout.blocks))))
     count = len(layout.blocks)
     return short if short * CHUNKS >= count else ceil(count / CHUNKS_OF_LOOPS)
 
@@ -295,6 +307,16 @@ def _composition(stage: Linearisation, length: int) -> tuple[Linearisation, ca.F
         curve_ux += ca.mtimes(ca.mtimes(v.T, l_xx) + l_ux, x)
         curve_uu += ca.mtimes(ca.mtimes(v.T, l_xx), v) + cross + cross.T + l_uu
         x, v = ca.densify(ca.mtimes(f_x, x)), ca.densify(ca.mtimes(f_x, v) + f_u)
-    pieces = [ca.densify(m) for m in (x, v, ca.vertcat(*c_of_x), ca.vertcat(*c_of_u), slope_x, slope_u, curve_xx, curve_ux, curve_uu)]
-    packed = ca.vertcat(*(ca.vec(piece) for piece in pieces))
-    return Linearisation(tuple(piece.sparsity() for piece in pieces)), ca.Function("compose", [vector], [packed])
+    pieces = (x, v, ca.vertcat(*c_of_x), ca.vertcat(*c_of_u), slope_x, slope_u, curve_xx, curve_ux, curve_uu)
+    packed = ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+    return _form(stage, length), ca.Function("compose", [vector], [packed])
+
+
+def _form(stage: Linearisation, length: int) -> Linearisation:
+    """The form of the derivatives of so many intervals as one: dense, but for a single one."""
+    if length == 1:
+        return stage
+    nx, nu, width = stage.shape
+    rows = length * width
+    shapes = ((nx, nx), (nx, nu), (rows, nx), (rows, nu), (nx, 1), (nu, 1), (nx, nx), (nu, nx), (nu, nu))
+    return Linearisation(tuple(ca.Sparsity.dense(*shape) for shape in shapes))

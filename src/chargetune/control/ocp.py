@@ -212,7 +212,7 @@ def control_problem(controller: Controller) -> Problem:
         scaling=lean(scaling(layout, stage, final)),
         quadratic=lean(quadratic(layout, stage, final)),
         curvature=curvature(layout, [row_weight(i, horizon) for i in range(horizon)], follow, seconds, adjoints, window),
-        convex=convex(layout, stage, final),
+        convex=convex(layout, stage, final, exact=exact),
         residual=lean(residual(layout, adjoints)),
         merit=lean(merit(layout)),
         fallback=window.of_stage(ca.Function("fallback", [now, q], [fallback]), 0),

@@ -24,8 +24,10 @@ def merit(layout: Layout) -> ca.Function:
     total = cost
     if layout.prices:
         s = layout.violations(rows)
+        total += ca.dot(ca.DM(layout.prices), s + s**2 / 2)
+    if layout.groups:
         # The running maximum drops a NaN; the sum keeps it, so that the line search refuses the point.
-        total = ca.if_else(finite(ca.sum1(rows)), cost + ca.dot(ca.DM(layout.prices), s + s**2 / 2), np.inf)
+        total = ca.if_else(finite(ca.sum1(rows)), total, np.inf)
     return ca.Function("merit", [cost, rows], [total])
 
 
