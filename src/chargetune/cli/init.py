@@ -56,11 +56,6 @@ name = "backoff_sd" # margin in standard deviations of the predicted voltage
 lower = 0.1
 upper = 6.0
 
-[[theta.observer]]
-name = "resistance_rate" # how fast the observer follows a resistance that changes with the state of charge
-lower = 0.2
-upper = 10.0
-
 # What differs between the cells and the charges that the controller will meet; the certificate is drawn from the same.
 [range]
 soc_start = [0.05, 0.5]
