@@ -46,7 +46,7 @@ class ChargingRangeSettings:
     voltage_bias_V
         The voltage sensor reads too much by +- this; new in each charge.
     draws
-        Fresh draws of one trial of the tuner "range": where 1 % of all plants break a limit, 300 show one with probability 0.95.
+        Fresh draws of one trial of the tuner "range": where 0.3 % of all plants break a limit, 1000 show one with probability 0.95.
 
     Raises ValueError naming field, value and what is allowed.
     """
@@ -61,7 +61,7 @@ class ChargingRangeSettings:
     fade: float = 0.0
     growth: float = 0.0
     voltage_bias_V: float = 0.0
-    draws: int = 300
+    draws: int = 1000
 
     def __post_init__(self) -> None:
         for name, most in (("resistance", 0.9), ("resistance_by_node", 0.9), ("capacitance", 0.9), ("capacitance_by_node", 0.9)):

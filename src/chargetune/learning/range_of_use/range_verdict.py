@@ -61,7 +61,7 @@ class RangeEvaluation:
     """
 
     loop: RangeLoop
-    plants: int = 300
+    plants: int = 1000
     aim: Aim = "mean"
 
     def __post_init__(self) -> None:
