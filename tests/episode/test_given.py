@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from chargetune.control.controller import Controller, SoftLimit
-from chargetune.control.kalman import ExtendedKalman
 from chargetune.control.ipopt_reference import ipopt_act
+from chargetune.control.kalman import ExtendedKalman
 from chargetune.episode.compiled import compiled_episode, simulate
 from chargetune.episode.stepwise import run_episode
 from chargetune.model.model import Model, Signal
