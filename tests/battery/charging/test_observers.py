@@ -216,6 +216,6 @@ def test_the_example_with_feedback_is_the_first_row_of_the_table():
 
 def test_the_example_with_an_electrochemical_cell_runs():
     own = load_config(EXAMPLES / "dfn_offset_free.toml").problem(EXAMPLES)
-    episode = run_charge(replace(own, plant=replace(own.plant, model="SPM"), episode=replace(own.episode, steps=4)))
-    assert len(episode) == 4
+    episode = run_charge(replace(own, plant=replace(own.plant, model="SPM"), episode=replace(own.episode, steps=6)))
+    assert len(episode) == 6
     assert episode.failures == 0
