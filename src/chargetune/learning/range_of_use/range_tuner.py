@@ -12,7 +12,7 @@ from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import samples_of
 from chargetune.learning.closed_loop.slp import Point, solve_slp
 from chargetune.learning.initial_design import sobol_points
-from chargetune.learning.range_of_use.range_verdict import PlantResult, RangeEvaluation, objective_over, run_plants
+from chargetune.learning.range_of_use.range_verdict import PlantResult, RangeEvaluation, objective_over
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.range_of_use import DrawnPlant
@@ -64,8 +64,8 @@ class RangeTuner:
 
     (or the worst J_j) by `solve_slp`. The first theta is chosen on `RangeSettings.plants` draws, with the margin m = 0; each trial
     tries a theta on fresh draws. Those on which it was nearest to a limit join the rows, not the mean (the scenario approach with
-    sampling and discarding none: Calafiore and Campi, IEEE Trans. Autom. Control 51 (2006) 742), and m is by how much the worst of them
-    was worse than the worst plant that this theta was chosen on: what the choice made of plants hides. The result is the best of
+    sampling and discarding none: Calafiore and Campi, IEEE Trans. Autom. Control 51 (2006) 742). m is by how much their worst excess
+    is above the least of theirs, in the mean: the scale of the tail, if it is exponential, beyond what was drawn. The result is the best of
     several trials that kept every limit, so its own draws flatter it a little: a certificate draws others.
     """
 
@@ -78,35 +78,34 @@ class RangeTuner:
         check_count(n)
         done = [t for t in trials if t.score is not None]
         common, worst = self.evaluation.loop.draw(self.settings.plants, self.seed), [self._worst(trial) for trial in done]
-        margin = 0.0
-        if done:
-            before = [*common, *(one.plant for results in worst[:-1] for one in results)]
-            chosen_on = run_plants(self.evaluation.loop, np.array(done[-1].theta), before)
-            margin = max(0.0, worst[-1][0].beyond - max(one.beyond for one in chosen_on))
+        tail = [one.beyond for one in worst[-1]] if done else [0.0]
+        margin = float(np.mean(tail)) - tail[-1]
         # The newest trial's worst plants come first: starts are compared on them.
         added = [one.plant for results in reversed(worst) for one in results]
-        search = _RangeSearch(self.evaluation, space, common, added, margin if np.isfinite(margin) else 0.0, self.settings)
-        start = self._start(space, search, np.array(done[-1].theta) if done else space.default)
-        return np.tile(space.from_unit(search.refine(start)), (n, 1))
+        search = _RangeSearch(self.evaluation, space, common, added, margin, self.settings)
+        last = space.to_unit(np.array(done[-1].theta) if done else space.default)
+        # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
+        found = [search.refine(start) for start in {u.tobytes(): u for u in (last, self._start(space, search, last))}.values()]
+        return np.tile(space.from_unit(min(found, key=search.merit_of_all)), (n, 1))
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""
         results = self.evaluation.results(np.array(trial.theta), int(trial.seed))  # type: ignore[attr-defined]
         return sorted(results, key=lambda one: -one.beyond)[: self.settings.added]
 
-    def _start(self, space: ParameterSpace, search: _RangeSearch, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The best of this theta, the two extreme corners and Sobol points on a few plants.
+    def _start(self, space: ParameterSpace, search: _RangeSearch, last: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The best of this point, the two extreme corners and Sobol points on a few plants.
 
         A start within the limits matters: where the input is saturated, a violation does not change with theta, and beside one that
         cannot be mended all others would be let grow as large.
         """
         corners = [np.zeros(space.dimension), np.ones(space.dimension)]
-        points = [space.to_unit(theta), *corners, *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
+        points = [last, *corners, *sobol_points(space.dimension, self.seed, 0, self.settings.pool)]
         return min(points, key=search.merit)
 
 
 class _RangeSearch:
-    """Points of the unit cube on several plants at once: the objective is that of ``common`` ones, the rows are those of ``added`` ones too.
+    """Points of the unit cube on several plants: the objective is that of ``common`` ones, rows are those of ``added`` ones too.
 
     ``margin`` in tolerances.
     """
@@ -129,9 +128,12 @@ class _RangeSearch:
         return np.clip(found, 0.0, 1.0)
 
     def merit(self, u: NDArray[np.float64]) -> float:
-        """The objective on a few plants, to be minimised, and the worst violation at the penalty that `solve_slp` begins with."""
-        point = self._point(u, self._plants[: self._settings.first])
-        return np.inf if point is None else point.objective + abs(point.objective) * point.violation
+        """The objective on a few plants, to be minimised, and the worst violation with a penalty."""
+        return _merit(self._point(u, self._plants[: self._settings.first]))
+
+    def merit_of_all(self, u: NDArray[np.float64]) -> float:
+        """The same on all plants."""
+        return _merit(self._point(u, self._plants))
 
     def _points(self, us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
         return [self._point(u, self._plants) for u in us]
@@ -149,3 +151,8 @@ class _RangeSearch:
         # The worst plants of trials are no fair sample of what a theta is worth.
         common = worth[self._added :] if len(plants) == len(self._plants) else worth
         return Point(-objective_over(self._aim, common), np.concatenate(rows))
+
+
+def _merit(point: Point | None) -> float:
+    """A violation of a whole tolerance counts as a tenth of the objective: fresh plants judge, and the next search mends it."""
+    return np.inf if point is None else point.objective + 0.1 * abs(point.objective) * point.violation
