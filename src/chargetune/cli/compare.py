@@ -102,8 +102,10 @@ def _over_range(
         print(json.dumps({"range": use, "draws": draws, "rows": facts, "result": None if result is None else result.facts()}))  # noqa: T201
         return
     screen, table = console(), Table(box=None, pad_edge=False)
-    for heading in ("", "chosen", "over a limit", *(f"worst {limit}" for limit in limits), "mean t80 min", "mean t90 min", "t80 / oracle"):
-        table.add_column(heading, justify="left" if heading in ("", "chosen") else "right")
+    # At 80 columns a heading needs lines of its own.
+    worst = [f"worst\n{limit.replace('_', chr(10), 1)}" for limit in limits]
+    for heading in ("", "chosen", "over a\nlimit", *worst, "mean\nt80 min", "mean\nt90 min", "t80 to\noracle's"):
+        table.add_column(heading, justify="left" if heading in ("", "chosen") else "right", no_wrap=True)
     for column in table.columns[: 3 + len(limits)]:
         column.no_wrap = True
     for one in facts:
