@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from chargetune.control.estimators import finite
 from chargetune.control.layout import Layout
 from chargetune.control.linearisation import Linearisation, dense, straight
 from chargetune.runtime.split import split
@@ -113,7 +114,8 @@ def scaling(layout: Layout, stage: Linearisation, final: Linearisation) -> ca.Fu
     for scale, (of, own) in zip(reversed(ranges), reversed(blocks), strict=True):
         part, slope, weight, costate = weigh(of)(own, scale, weight, costate)
         total, steep = total + part, steep + slope
-    curvature, slope = total / layout.size, FLAT * steep / layout.size
+    # A derivative that is infinite where nothing depends on it (a root at 0) must not make gamma 0, with which all is optimal.
+    curvature, slope = (ca.if_else(finite(value), value, 0) / layout.size for value in (total, FLAT * steep))
     gamma = 1 / ca.fmax(ca.fmax(curvature, slope), 1e-12)
     near = ca.if_else(curvature < slope, 1 - gamma * ca.fmax(curvature, 0), 0)
     return ca.Function("scaling", [vector, lower, upper], [gamma, near])

@@ -62,7 +62,7 @@ def residual(layout: Layout, adjoints: tuple[ca.Function, ca.Function]) -> ca.Fu
         residuals.append(least(s, 1 + s - spent))
     everything = ca.fabs(ca.vertcat(*residuals))
     # A maximum drops a NaN; the sum keeps it.
-    worst = ca.if_else(finite(ca.sum1(everything)), largest(everything.T), np.inf)
+    worst = ca.if_else(ca.logic_and(finite(ca.sum1(everything)), gamma > 0), largest(everything.T), np.inf)
     return ca.Function("residual", [inputs, rows, vector, multipliers, gamma, lower, upper], [worst])
 
 

@@ -98,7 +98,7 @@ def test_the_table_survives_the_store_and_says_how_many_plants_a_trial_has(tmp_p
     assert problem == config.problem()
     assert problem.range.soc_start == (0.1, 0.4)
     assert evaluation_of("range", problem).plants == 17
-    assert evaluation_of("range", replace(problem, range=ChargingRangeSettings())).plants == 300
+    assert evaluation_of("range", replace(problem, range=ChargingRangeSettings())).plants == 1000
 
 
 def test_what_is_drawn_by_entry():
