@@ -56,7 +56,7 @@ def run_charging(path, config, *, reach=0.7, cut=(), raising=(), trials=TRIALS):
     def evaluate(theta, seed):
         number = next(numbers)
         if number in raising:
-            raise RuntimeError("the cycler lost its connection")
+            raise RuntimeError(f"the cycler lost its connection at trial {number}")
         score, episode, ending = Evaluation(problem)(theta, seed)
         if number in cut:
             return None, episode.cut(CUT, Ending.LIMIT, "too hot"), "limit trip: too hot"

@@ -162,10 +162,10 @@ def _said(screen: Console) -> Iterator[None]:
 
 def _end(safety: dict[str, Any] | None, trials: Sequence[Trial] = ()) -> None:
     """A last line and an exit code that say so where nothing can have come of it."""
-    if trials and all(t.score is None for t in trials):
-        raise ValueError(f"no trial has a score; the last one ended with: {trials[-1].ending}")
     if safety and safety["stopped"]:
         raise ValueError(f"stopped before the last trial: {safety['stopped']}")
+    if trials and all(t.score is None for t in trials):
+        raise ValueError(f"no trial has a score; the last one ended with: {trials[-1].ending}")
 
 
 def _safety(config: Config, problem: ChargingProblem, study: Study, trials: Sequence[Trial], stopped: str) -> dict[str, Any] | None:

@@ -64,7 +64,7 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
         names = []
     names += ["nominal MPC"]
     if problem.estimator.kind not in ("offset_free", "adaptive"):
-        names.append("offset-free MPC, untuned")
+        names.append("nominal offset-free MPC")
     names.append("best constant backoff")
     if problem.plant is None:
         names.append("MPC with the true model")
@@ -101,7 +101,7 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
             problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.cell.capacity_Ah)), voltage
         ),
         "plant oracle": lambda: _stepped(problem, name, constant_current(largest), list(problem.limits_by_name.values())),
-        "offset-free MPC, untuned": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
+        "nominal offset-free MPC": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
         "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
         "MPC with the true model": lambda: _judged(plain, name, run_charge(true, None, seed)),
