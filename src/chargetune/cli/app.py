@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import traceback
 from enum import StrEnum
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
+from chargetune.runtime.interrupts import handled_interrupts
 
 __all__ = ["app", "main"]
 
@@ -390,10 +389,9 @@ def main() -> None:
     it comes from a user's file, who reads the file says so in a ValueError that names it. So it is a defect, and shows its traceback.
     """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        app()
+        with handled_interrupts():
+            app()
     except SystemExit as ended:
         # That is what typer makes of KeyboardInterrupt, without a word.
         if ended.code == INTERRUPTED:

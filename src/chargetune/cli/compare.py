@@ -103,8 +103,8 @@ def _over_range(
         return
     screen, table = console(), Table(box=None, pad_edge=False)
     # At 80 columns a heading needs lines of its own.
-    worst = [f"worst\n{limit.replace('_', chr(10), 1)}" for limit in limits]
-    for heading in ("", "chosen", "over a\nlimit", *worst, "mean\nt80 min", "mean\nt90 min", "t80 to\noracle's"):
+    excesses = [f"worst\n{limit.replace('_', chr(10), 1)}" for limit in limits]
+    for heading in ("", "chosen", "over a\nlimit", *excesses, "mean\nt80 min", "mean\nt90 min", "t80 to\noracle's"):
         table.add_column(heading, justify="left" if heading in ("", "chosen") else "right", no_wrap=True)
     for column in table.columns[: 3 + len(limits)]:
         column.no_wrap = True

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import ParameterSpace
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.dataframe import study_html, trials_dataframe
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import process_executor
@@ -331,6 +332,7 @@ class Study:
             losses = Losses({t.number for t in begun}, attempts, partial(self.store.count_loss, self.record.id, term=self.term))
             finished = stack.enter_context(closing(outcomes(evaluate, following, executor, losses)))
             for trial, outcome in finished:
+                raise_lost_interrupt()
                 tally.add(self.finish(trial.number, outcome.score, outcome.trace, outcome.ending, attempt=trial.attempt))
                 if outcome.score is None:
                     _refuse_sameness(self.trials())
