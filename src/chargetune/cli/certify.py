@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
@@ -121,13 +122,13 @@ def _print(certificate: dict[str, Any]) -> None:
     f, origin = certificate["figures"], certificate["origin"]
     screen = console()
     screen.print(
-        f"[bold]{certificate['cell']['name']}[/], study {origin['study']!r}, trial {origin['trial']}: "
+        f"[bold]{escape(certificate['cell']['name'])}[/], study {origin['study']!r}, trial {origin['trial']}: "
         f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
         soft_wrap=True,
     )
     screen.print(f"[dim]trial {origin['trial']}: {origin['why']}[/]", soft_wrap=True)
     if certificate["cell"]["remark"]:
-        screen.print(f"[dim]{certificate['cell']['remark']}[/]")
+        screen.print(f"[dim]{escape(certificate['cell']['remark'])}[/]")
     bound, confidence = f["violation_probability_upper"], certificate["confidence"]
     screen.print(f"probability of a violation at most {100 * bound:.2f} % (confidence {100 * confidence:g} %)")
     table = Table(box=None, pad_edge=False)

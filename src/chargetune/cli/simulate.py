@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.markup import escape
 
 from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.problem import ChargingProblem
@@ -54,10 +55,11 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
         return
     out = console()
     out.print(
-        f"[bold]{problem.cell.name}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, ended: {episode.ending.value}"
+        f"[bold]{escape(problem.cell.name)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
+        f"ended: {episode.ending.value}"
     )
     if problem.cell.remark:
-        out.print(f"[dim]{problem.cell.remark}[/]")
+        out.print(f"[dim]{escape(problem.cell.remark)}[/]")
     out.print(metrics_table({"this run": score}, problem))
 
 

@@ -201,9 +201,10 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
-    screen.print(f"\n[bold]{problem.cell.name}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    screen.print(f"\n[bold]{escape(problem.cell.name)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
     if problem.cell.remark:
-        screen.print(f"[dim]{problem.cell.remark}[/]")
+        screen.print(f"[dim]{escape(problem.cell.remark)}[/]")
+    screen.print(f"[dim]estimator {problem.estimator.line}[/]")
     first = everything[0].score if everything else None
     # A safe study does not begin with the untuned controller.
     label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"

@@ -86,6 +86,18 @@ class EstimatorSettings:
             raise ValueError(f"estimator: settings of {', '.join(given)} are given with kind = {self.kind!r}, allowed are its own")
 
     @property
+    def line(self) -> str:
+        """Its kind, and what it reads, in words."""
+        reads = {
+            "open_loop": "the SOC is measured, the voltage is not read",
+            "exact": "every state of the plant is known, which no real cell tells",
+            "kalman": "a filter on the voltage estimates SOC and overpotentials",
+            "offset_free": "a disturbance follows the error of the voltage",
+            "adaptive": "a disturbance and a factor of the resistances follow the voltage",
+        }
+        return f"{self.kind}: {reads[self.kind or 'open_loop']}"
+
+    @property
     def settings(self) -> Kalman | OffsetFree | Adaptive | None:
         """The settings of the filter; None where there is none."""
         match self.kind:

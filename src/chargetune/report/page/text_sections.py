@@ -68,13 +68,15 @@ def what_was_tuned(view: StudyView) -> str:
         plant = "its own circuit, simulated" if problem.plant is None else repr(problem.plant)
         control, charge = problem.controller, problem.episode
         seed = control.mismatch_seed
-        belief = "the plant's own" if seed is None else f"wrong by the factors of mismatch seed {seed}"
+        own = "the plant's own" if problem.plant is None else "those of the cell file's circuit"
+        belief = own if seed is None else f"wrong by the factors of mismatch seed {seed}"
         start = "of the range of use" if view.over_range and problem.range and problem.range.soc_start else f"{charge.soc_start:g}"
         facts = [
             ("cell", problem.cell.name),
             ("capacity", f"{problem.cell.capacity_Ah:g} Ah"),
             ("plant", plant),
             ("controller's parameters", belief),
+            ("estimator", problem.estimator.line),
             ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
             (
                 "charge",
