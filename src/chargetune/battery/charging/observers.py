@@ -80,7 +80,8 @@ class Adaptive:
         As in `OffsetFree`.
 
     gate_sd
-        Samples further off than so many standard deviations of the innovation are left out, at most ten in a row.
+        A sample further off than so many standard deviations of the innovation is left out, but never two in a row: a resistance four times
+        as large as believed looks like an outlier in every sample, and while they are left out the current goes on rising.
     """
 
     soc: Literal["counted", "measured", "estimated"] = "estimated"
@@ -161,7 +162,9 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
             process["soc"], start["soc"] = drift("soc_drift"), "soc_start_sd"
     first = partial(_soc_at_rest, cell=cell) if observer.soc_from_rest and observer.soc != "measured" else None
     gate = None if observer.gate_sd is None else "gate_sd"
-    return ExtendedKalman.of(model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, first=first)
+    return ExtendedKalman.of(
+        model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, rejections_max=1, first=first
+    )
 
 
 def voltage_backoff(cell: Cell, model: Model, current_max_A: float, observer: Observer) -> Callable[[Named, Named], Any]:
