@@ -19,6 +19,7 @@ from chargetune.battery.charging.range_settings import range_line
 from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.cli.output import beside, console, number
 from chargetune.cli.tune import bar
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
 from chargetune.study.result import read_result
 from chargetune.study.store.database import store_name
@@ -77,6 +78,7 @@ def certify_command(
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("certifying", total=episodes, note="")
         for portion in run_charges(problem, best.theta, seed=seed, episodes=episodes, executor=executor):
+            raise_lost_interrupt()
             charges += portion
             violating = sum(charge.score is None or not charge.score.feasible for charge in charges)
             progress.update(task, advance=len(portion), note=f"{violating} violating")

@@ -16,6 +16,7 @@ from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, number, result_line, shown
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
 from chargetune.study.result import StudyResult, read_result
 from chargetune.study.store.store import Store
@@ -57,6 +58,7 @@ def compare_command(
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("charging", total=len(names), note="")
         for row in compare(problem, theta, seed=seed, executor=executor):
+            raise_lost_interrupt()
             found[row.name] = row
             progress.update(task, advance=1, note=row.name)
     rows = [found[name] for name in names]
@@ -93,6 +95,7 @@ def _over_range(
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("charging", total=len(names), note="")
         for row in compare_range(problem, theta, draws=draws, seed=seed, executor=executor):
+            raise_lost_interrupt()
             found[row.name] = row
             progress.update(task, advance=1, note=row.name)
     limits = [limit for limit in problem.limits_by_name if limit != "voltage_min_V"]
@@ -106,8 +109,6 @@ def _over_range(
     excesses = [f"worst\n{limit.replace('_', chr(10), 1)}" for limit in limits]
     for heading in ("", "chosen", "over a\nlimit", *excesses, "mean\nt80 min", "mean\nt90 min", "t80 to\noracle's"):
         table.add_column(heading, justify="left" if heading in ("", "chosen") else "right", no_wrap=True)
-    for column in table.columns[: 3 + len(limits)]:
-        column.no_wrap = True
     for one in facts:
         worst = (_excess(limit, one["worst_excess"][limit]) for limit in limits)
         times = (number(one["mean_t80_min"]), number(one["mean_t90_min"]), number(one["ratio"], 3))
