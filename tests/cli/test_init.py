@@ -35,3 +35,13 @@ def test_the_cell_file_is_found_from_where_the_study_lies(tmp_path):
     config = load_config(folder / "mine.toml")
     assert config.cell.file == "../cell.toml"
     assert config.problem(folder).controller.current_ramp_A_s > 0
+
+
+def test_the_ramp_that_it_tells_of_is_one_that_can_be_tuned(tmp_path):
+    path = tmp_path / "mine.toml"
+    chargetune("init", path)
+    text = path.read_text()
+    for line in ("[theta.current_ramp]", "lower_A_s", "upper_A_s"):
+        text = text.replace(f"# {line}", line)
+    path.write_text(text)
+    assert "current_ramp_A_s" in load_config(path).problem(tmp_path).space.entries

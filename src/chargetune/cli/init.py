@@ -56,6 +56,11 @@ name = "backoff_sd" # margin in standard deviations of the predicted voltage
 lower = 0.1
 upper = 6.0
 
+# The ramp of the current can be tuned as well:
+# [theta.current_ramp]
+# lower_A_s = {ramp_least:.3g}
+# upper_A_s = {ramp_most:.3g}
+
 # What differs between the cells and the charges that the controller will meet; the certificate is drawn from the same.
 [range]
 soc_start = [0.05, 0.5]
@@ -78,8 +83,9 @@ def init_command(path: Path, *, cell: Path | None) -> None:
     if cell is not None:
         largest = load_cell(cell).current_max_A
         line = f"file = {json.dumps(os.path.relpath(cell, path.parent))}"
-    # A minute from rest to the largest current.
-    text = TEXT.format(name=path.name, stem=path.stem, cell=line, ramp=largest / 60)
+    # A minute from rest to the largest current; tuned, between five minutes and six seconds.
+    ramp = {"ramp": largest / 60, "ramp_least": largest / 300, "ramp_most": largest / 6}
+    text = TEXT.format(name=path.name, stem=path.stem, cell=line, **ramp)
     write_whole(path, text)
     load_config(path).problem(path.parent)
     console().print(f"study file in {path}\nnext: chargetune check {path}", markup=False, soft_wrap=True)

@@ -15,7 +15,7 @@ from chargetune.battery.charging.metrics import charging_metrics
 from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.ringing import check_ringing
 from chargetune.battery.charging.settings import EstimatorSettings
-from chargetune.battery.charging.tunables import ObserverSetting
+from chargetune.battery.charging.tunables import CurrentRamp, ObserverSetting
 from chargetune.battery.studies.study_file import load_config
 from chargetune.control.riccati import steady_filter
 from chargetune.episode.stepwise import run_episode
@@ -118,6 +118,16 @@ def test_a_ramp_limits_how_fast_the_current_rises():
     assert free[0] == pytest.approx(CELL.current_max_A, abs=1e-3)
 
 
+def test_theta_may_be_the_ramp():
+    own = problem("offset_free", 0, steps=40, current_ramp_A_s=0.1, current_ramp=CurrentRamp(0.01, 1.0))
+    assert own.space.entries == ("current_ramp_A_s",)
+    assert own.space.default == pytest.approx([0.1])
+    for ramp in (0.02, 0.1):
+        told = problem("offset_free", 0, steps=40, current_ramp_A_s=ramp)
+        np.testing.assert_allclose(run_charge(own, [ramp]).input, run_charge(told).input, atol=1e-6)
+    assert run_charge(own, [0.02]).input[0, 0] == pytest.approx(0.2, abs=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["offset_free", "adaptive"])
 def test_theta_may_be_any_number_of_the_observer(kind):
     values = {"offset_drift_V": 0.02, "voltage_sd_V": 0.004, "backoff_sd": 1.0}
@@ -193,6 +203,13 @@ def test_the_check_of_a_problem_tells_of_it():
         (lambda: problem("offset_free", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["voltage_sd_V = 0.002", "[0.1, 1]"]),
         (lambda: problem("offset_free", observer=(ObserverSetting("backoff_sd", 0.1, 5.0),) * 2), ["backoff_sd", "different names"]),
         (lambda: problem("open_loop", current_ramp_A_s=0.0), ["current_ramp_A_s = 0.0"]),
+        (lambda: problem("open_loop", current_ramp=CurrentRamp(0.01, 1.0)), ["theta.current_ramp", "current_ramp_A_s", "[0.01, 1] A/s"]),
+        (
+            lambda: problem("open_loop", current_ramp_A_s=2.0, current_ramp=CurrentRamp(0.01, 1.0)),
+            ["current_ramp_A_s = 2.0", "[0.01, 1] A/s", "theta.current_ramp"],
+        ),
+        (lambda: CurrentRamp(0.0, 1.0), ["current ramp: lower_A_s = 0.0"]),
+        (lambda: CurrentRamp(0.5, 0.5), ["current ramp: upper_A_s = 0.5"]),
     ],
 )
 def test_refusals(make, words):

@@ -49,7 +49,8 @@ def _build(problem: ChargingProblem) -> Controller:
         bound = largest * theta.current_limit.share(stage) if theta.current_limit else largest
         if settings.current_ramp_A_s is None:
             return bound
-        return ca.fmin(bound, ca.fmax(stage.now["last_current_A"], 0.0) + settings.current_ramp_A_s * settings.sampling_time_s)
+        ramp = stage.theta["current_ramp_A_s"] if theta.current_ramp else settings.current_ramp_A_s
+        return ca.fmin(bound, ca.fmax(stage.now["last_current_A"], 0.0) + ramp * settings.sampling_time_s)
 
     # Both models come from the same cell, so that the compiled problem is the same for every mismatch.
     belief = problem.controller_cell
