@@ -118,6 +118,13 @@ def test_a_ramp_limits_how_fast_the_current_rises():
     assert free[0] == pytest.approx(CELL.current_max_A, abs=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["open_loop", "exact", "kalman"])
+def test_every_other_kind_has_the_ramp_as_well(kind):
+    ramped = run_charge(problem(kind, 0, steps=10, current_ramp_A_s=0.1))
+    assert len(ramped) == 10
+    np.testing.assert_allclose(ramped.input[:5, 0], np.arange(1.0, 6.0), atol=1e-3)
+
+
 def test_theta_may_be_the_ramp():
     own = problem("offset_free", 0, steps=40, current_ramp_A_s=0.1, current_ramp=CurrentRamp(0.01, 1.0))
     assert own.space.entries == ("current_ramp_A_s",)
@@ -164,6 +171,25 @@ def test_a_charge_tells_apart_what_rest_does_not():
     assert {"resistance_log_factor", "soc", "voltage_V_offset"} <= alike
     episode = run_charge(problem("adaptive", None, steps=200))
     assert undetectable(own.model, ("voltage_V",), episode.estimate[:150], episode.input[:150], scale=scale) == []
+
+
+def test_an_ocv_and_resistances_that_say_nothing_of_the_soc_are_found():
+    """On a straight OCV and constant resistances an offset of the voltage is as an error of the SOC; a flat one hides the SOC."""
+    nodes = len(CELL.soc)
+    tables = {"R0_ohm": (0.02,) * nodes, "R1_ohm": (0.015,) * nodes, "C1_F": (2000.0,) * nodes}
+    straight = replace(CELL, ocv_soc=(0.0, 0.2, 0.6, 1.0), ocv_V=(3.2, 3.39, 3.77, 4.15), **tables)
+    flat = replace(CELL, ocv_soc=(0.0, 0.1, 0.9, 1.0), ocv_V=(3.1, 3.3, 3.302, 3.4), voltage_max_V=3.45, voltage_min_V=2.5, **tables)
+    for cell, kind, words in (
+        (straight, "adaptive", "soc, voltage_V_offset cannot be told apart from voltage_V"),
+        (flat, "kalman", "soc cannot be seen from voltage_V"),
+        (flat, "offset_free", None),
+    ):
+        own = charging_problem(cell, mismatch_seed=None, kind=kind, steps=150, soc_start=0.3, soc_target=0.8)
+        found = [f for f in check_charging(own, quick=True) if f.code == "observer-undetectable"]
+        assert len(found) == (words is not None)
+        if words:
+            assert words in found[0].message
+            assert "(soc 0.3 to" in found[0].message
 
 
 DEADBEAT = OffsetFree(offset_drift_V=0.5, voltage_sd_V=1e-3, backoff_sd=0.0)
