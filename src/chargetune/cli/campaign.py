@@ -17,6 +17,7 @@ from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.studies.campaign import Entry, Standing, load_campaign, run_campaign, standings
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, number, shown
+from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.study.executors import process_executor
 from chargetune.study.store.store import Store
 
@@ -29,6 +30,10 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
     """Tune every study file with every seed; exit code 1 when a study had to stop."""
     entries = load_campaign(path)
     kept = store or f"{path.stem}.sqlite"
+    read = {e.source: read_by(e.folder / Path(e.source).name, e.config.model_dump()) for e in entries}
+    if "://" not in kept:
+        inputs = [path, *(file for files in read.values() for file in files)]
+        claim([Output("store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
     _check(entries, force=force)
     with Store(kept) as opened:
         found = standings(opened, entries)

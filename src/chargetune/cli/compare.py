@@ -14,6 +14,7 @@ from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRo
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, number, result_line, shown
+from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
 from chargetune.runtime.interrupts import raise_lost_interrupt
@@ -33,12 +34,16 @@ def compare_command(
     draws: int | None,
     workers: int,
     figure: Path | None,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
         check_format(figure)
     config = load_config(path)
+    if figure is not None:
+        read = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
+        claim([Output("--figure", figure, figure_kind(figure))], inputs=read, overwrite=overwrite, folders=False)
     problem = config.problem(path.parent)
     result = None if store is None else _result(store, study or config.study.name)
     theta = None if result is None or result.trial is None else problem.space.validate(result.trial.theta).tolist()
@@ -82,7 +87,7 @@ def compare_command(
     if store is None:
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:
-        screen.print(f"figure {figure}")
+        screen.print(f"figure {figure}", markup=False, soft_wrap=True)
 
 
 def _over_range(
