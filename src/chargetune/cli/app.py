@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
-from chargetune.runtime.interrupts import handled_interrupts
+from chargetune.runtime.interrupts import INTERRUPTED, Watch, handled_interrupts
 
 __all__ = ["app", "main"]
 
@@ -25,7 +25,6 @@ app = typer.Typer(
 )
 store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
-INTERRUPTED = 130
 # EX_SOFTWARE of sysexits.h.
 DEFECT = 70
 
@@ -393,6 +392,10 @@ def store_migrate(store: StoreArgument) -> None:
 
 # What --debug said, for who reports an error after the command has ended.
 _debug: list[bool] = []
+# The command that runs, for who reports that it was interrupted.
+_command: list[str] = []
+# These keep each trial when it is told.
+RESUMABLE = ("tune", "campaign", "reproduce")
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
@@ -403,10 +406,12 @@ def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the opt
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: ARG001
     debug: Annotated[bool, typer.Option("--debug", help="With an error show where in the program it came from.")] = False,
 ) -> None:
     _debug.append(debug)
+    _command[:] = [context.invoked_subcommand or ""]
 
 
 def main() -> None:
@@ -417,12 +422,12 @@ def main() -> None:
     """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
     try:
-        with handled_interrupts():
+        with handled_interrupts(Watch(_stopping, _interrupted)):
             app()
     except SystemExit as ended:
         # That is what typer makes of KeyboardInterrupt, without a word.
         if ended.code == INTERRUPTED:
-            typer.echo("interrupted; the same command resumes", err=True)
+            _interrupted()
         raise
     except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
         if type(error) is ValueError or isinstance(error, OSError):
@@ -441,6 +446,20 @@ def main() -> None:
         what = f"{type(error).__name__}: {error}"
         typer.echo(f"chargetune: a defect of this program ({what}); please report it with the lines above", err=True)
         sys.exit(DEFECT)
+
+
+def _stopping() -> None:
+    what = "trials that are told are kept" if _resumable() else "what runs is given up"
+    # Whatever stands in the line, a progress bar for instance.
+    typer.echo(f"\nstopping, {what}; a second Ctrl-C ends at once", err=True)
+
+
+def _interrupted() -> None:
+    typer.echo(f"interrupted; the same command {'resumes' if _resumable() else 'begins again'}", err=True)
+
+
+def _resumable() -> bool:
+    return any(name in RESUMABLE for name in _command)
 
 
 def _refuse(error: BaseException) -> NoReturn:

@@ -17,7 +17,7 @@ from chargetune.battery.certification.default_range import default_range
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.range_settings import range_line
 from chargetune.battery.studies.study_file import problem_of_document
-from chargetune.cli.output import beside, console, number
+from chargetune.cli.output import beside, console, number, workers_for
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
 from chargetune.runtime.interrupts import raise_lost_interrupt
@@ -78,6 +78,7 @@ def certify_command(
     claim(outputs, inputs=[location], overwrite=overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     charges: list[Charge] = []
+    workers = workers_for(workers, episodes, "episodes")
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))

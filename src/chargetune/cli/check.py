@@ -16,6 +16,7 @@ from chargetune.battery.studies.study_file import load_config
 from chargetune.checks.finding import Finding
 from chargetune.cli.output import console
 from chargetune.cli.outputs import Kind, Output, claim, read_by
+from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["check_command", "facts", "print_findings"]
 
@@ -37,6 +38,7 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
     else:
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
+    raise_lost_interrupt()
     drawn: list[Path] = []
     if figures is not None and findings:
         from chargetune.report.figures.check_findings import save_findings

@@ -13,7 +13,7 @@ from chargetune.battery.baselines.comparison import Row, compare, row_names
 from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
-from chargetune.cli.output import console, number, result_line, shown
+from chargetune.cli.output import console, number, result_line, shown, workers_for
 from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
@@ -57,6 +57,7 @@ def compare_command(
     if draws is not None:
         raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
     names = row_names(problem, theta)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, Row] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -94,6 +95,7 @@ def _over_range(
     problem: ChargingProblem, theta: list[float] | None, result: StudyResult | None, *, draws: int, seed: int, workers: int, as_json: bool
 ) -> None:
     names = range_row_names(problem, theta)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, RangeRow] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None

@@ -19,6 +19,7 @@ from chargetune.battery.identification.record import Record
 from chargetune.cli.output import console
 from chargetune.cli.outputs import Kind, Output, claim, figure_kind
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.files import write_whole
 
 __all__ = ["identify_command"]
@@ -49,6 +50,7 @@ def identify_command(
     checks = [(record.source, *_check(found, record)) for record in known]
     today = datetime.now().astimezone().date().isoformat()
     found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+    raise_lost_interrupt()
     out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, cell_toml(found.cell, found.remarks))
     # What was written is what a controller will read.

@@ -11,7 +11,7 @@ from rich.table import Table
 from chargetune.battery.case_study.configurations import case_study
 from chargetune.battery.case_study.reproduce import reproduce, summarise
 from chargetune.battery.studies.study_file import TunerName
-from chargetune.cli.output import console, number
+from chargetune.cli.output import console, number, workers_for
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor
@@ -56,7 +56,8 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
         overwrite=overwrite,
     )
     out.mkdir(parents=True, exist_ok=True)
-    with process_executor(min(workers, len(numbers))) as executor, bar(quiet=as_json) as progress:
+    workers = workers_for(workers, len(numbers), "seeds")
+    with process_executor(workers) as executor, bar(quiet=as_json) as progress:
         task = progress.add_task(f"{case}, {tuner}", total=len(numbers), note="")
         safe = 0
 

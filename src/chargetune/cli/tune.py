@@ -22,7 +22,7 @@ from chargetune.battery.charging.verdict import charge_time, violation_mVs
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
+from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines, workers_for
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
@@ -134,9 +134,14 @@ def _run(
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
         study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed))
-        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
+        # Without batches more workers have something to do only if the order of the trials is given up for them; and
+        # not with a tuner whose every step needs the trial before it.
+        alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
+        at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
+        workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
         if study.earlier and not quiet:
@@ -157,9 +162,6 @@ def _run(
 
         stopped = ""
         try:
-            # Without batches more workers have something to do only if the order of the trials is given up for them; and
-            # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
             ahead = workers if workers > 1 and not alone else None
             study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
