@@ -9,6 +9,7 @@ from pathlib import Path
 from chargetune.battery.cell.cell import load_cell
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.study.files import write_whole
 
 __all__ = ["init_command"]
@@ -72,12 +73,9 @@ growth = 0.2             # and all resistances have grown by this one
 """
 
 
-def init_command(path: Path, *, cell: Path | None) -> None:
-    """Write a commented study file that runs. Raises ValueError where there is one already, or the cell file is none."""
-    if path.exists():
-        raise ValueError(f"{path} exists, allowed is the name of a new file")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no folder {path.parent}")
+def init_command(path: Path, *, cell: Path | None, overwrite: bool) -> None:
+    """Write a commented study file that runs. Raises ValueError where it may not be written, or the cell file is none."""
+    claim([Output("study file", path, Kind.STUDY)], inputs=[] if cell is None else [cell], overwrite=overwrite, folders=False)
     largest = 6.0
     line = '# file = "cell.toml" # as `chargetune identify` writes it; without it the case study\'s cell'
     if cell is not None:
