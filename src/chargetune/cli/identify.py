@@ -14,8 +14,7 @@ from rich.table import Table
 from chargetune.battery.cell.cell import load_cell
 from chargetune.battery.identification.cycler_files import read_record
 from chargetune.battery.identification.pulse_fit import Identification, cell_toml, identify, predicted_voltage
-from chargetune.battery.identification.pulses import segments
-from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.record import Record, segments
 from chargetune.cli.output import console
 from chargetune.cli.outputs import Kind, Output, claim, figure_kind
 from chargetune.report.figures.style import check_format

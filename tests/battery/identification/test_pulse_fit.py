@@ -15,8 +15,9 @@ from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.identification.cycler_files import read_record
 from chargetune.battery.identification.pulse_fit import cell_toml, identify, predicted_voltage
-from chargetune.battery.identification.pulses import find_pulse_sets, groups, segments
-from chargetune.battery.identification.record import Record, checked
+from chargetune.battery.identification.plausibility import checked
+from chargetune.battery.identification.pulses import find_pulse_sets, groups
+from chargetune.battery.identification.record import Record, segments
 from chargetune.battery.identification.thermal import activation_energy, with_thermal
 from chargetune.battery.identification.virtual_bench import pulse_test, record_csv, slow_cycle
 from chargetune.battery.plants.steppable import as_steppable
