@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.checks.estimator import check_detectability
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_influence
 from chargetune.checks.solves import check_costs, check_solves
@@ -61,13 +62,14 @@ def check_formulation(
     finer: Model | None = None,
     quick: bool = False,
     given: Given | None = None,
+    along: str | None = None,
 ) -> tuple[Finding, ...]:
     """All checks of a controller that need no verdict on an episode; an unsafe start is told alone.
 
     ``plant`` is what the influence of theta is looked for on, by default a perfect model of the untuned controller.
     ``signs``: see `check_signs`; ``finer`` is the model with a shorter sampling time, for limits between samples.
     ``quick`` leaves out what builds other solvers when nothing is suspicious: longer horizons. ``given``: the given signals of
-    the controller and the plants.
+    the controller and the plants. ``along``: a state that tells the place in an episode, beside the time.
     """
     names = tuple(dict.fromkeys((*controller.given_names, *(plant.given if plant else ()))))
     # What is checked is the formulation: with forecasts that are right.
@@ -83,6 +85,7 @@ def check_formulation(
     found += check_costs(controller)
     if run.state is not None and len(run):
         found += check_solves(run)
+        found += check_detectability(controller, run, _signals(controller, given, len(run))[0], along)
         found += check_signs(controller, signs or {}, run.state, run.input, given=first)
         found += check_horizon(controller, run.state, run.input, given=first)
         found += check_limits(controller, run, finer=finer, given=own)

@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
-from chargetune.runtime.interrupts import handled_interrupts
+from chargetune.runtime.interrupts import INTERRUPTED, Watch, handled_interrupts
 
 __all__ = ["app", "main"]
 
@@ -25,7 +25,6 @@ app = typer.Typer(
 )
 store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
-INTERRUPTED = 130
 # EX_SOFTWARE of sysexits.h.
 DEFECT = 70
 
@@ -59,6 +58,25 @@ class TunerChoice(StrEnum):
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 StoreArgument = Annotated[str, typer.Argument(help="Store: a file, or postgresql://user@host/database.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program instead of text for a person.")]
+
+
+class Branch(StrEnum):
+    """Which rests of a cell with hysteresis the OCV is."""
+
+    CHARGE = "charge"
+    DISCHARGE = "discharge"
+    MIDDLE = "middle"
+
+
+class Sign(StrEnum):
+    """What a positive current of a cycler's file does."""
+
+    CHARGE = "charge"
+    DISCHARGE = "discharge"
+    UNSIGNED = "unsigned"
+
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of the same kind that exist.")]
 Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 
 
@@ -66,11 +84,12 @@ Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 def init(
     path: Annotated[Path, typer.Argument(help="Study file to write.")] = Path("study.toml"),
     cell: Annotated[Path | None, typer.Option(help="Cell file, as `identify` writes it.")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a commented study file that runs."""
     from chargetune.cli.init import init_command
 
-    init_command(path, cell=cell)
+    init_command(path, cell=cell, overwrite=overwrite)
 
 
 @app.command()
@@ -85,6 +104,7 @@ def tune(
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     accept_changed: Annotated[bool, typer.Option("--accept-changed", help="Resume although the study file has changed.")] = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
@@ -99,6 +119,7 @@ def tune(
         out=out,
         force=force,
         accept_changed=accept_changed,
+        overwrite=overwrite,
         as_json=as_json,
     )
 
@@ -124,12 +145,13 @@ def check(
     config: ConfigFile,
     safe: Annotated[str | None, typer.Option(help="A theta declared safe, as for simulate --theta; it has to keep every limit.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for a figure of each finding.")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Find errors of a formulation before anything is tuned; exit code 1 when there are any."""
     from chargetune.cli.check import check_command
 
-    check_command(config, safe=safe, figures=figures, as_json=as_json)
+    check_command(config, safe=safe, figures=figures, overwrite=overwrite, as_json=as_json)
 
 
 @app.command()
@@ -168,12 +190,13 @@ def report(
     evaluate: Annotated[
         bool, typer.Option(help="Evaluate the best theta and its neighbours on a simulated plant, for the sensitivities.")
     ] = True,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write one study as a self-contained HTML page, which opens offline."""
     from chargetune.cli.report import report_command
 
-    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, as_json=as_json)
+    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, overwrite=overwrite, as_json=as_json)
 
 
 @app.command()
@@ -201,18 +224,23 @@ def reproduce(
     out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(
         "out/reproduce"
     ),
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Repeat a study of Hirt et al. (ADCHEM 2024) over mismatch seeds and decide its claims."""
     from chargetune.cli.reproduce import reproduce_command
 
-    reproduce_command(case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, as_json=as_json)
+    reproduce_command(
+        case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, overwrite=overwrite, as_json=as_json
+    )
 
 
 @app.command()
 def identify(
-    data: Annotated[Path, typer.Argument(help="Measured pulses (CSV of a cycler).", show_default=False)],
-    out: Annotated[Path, typer.Option("--output", "-o", help="Cell file to write.")] = Path("cell.toml"),
+    data: Annotated[Path, typer.Argument(help="Measured pulses (a cycler's CSV, text, Excel or Parquet).", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--output", "-o", help="Cell file to write; of several temperatures one each, cell_25degC.toml.")
+    ] = Path("cell.toml"),
     rc: Annotated[int, typer.Option(min=1, max=2, help="R-C pairs of the circuit.")] = 1,
     capacity: Annotated[
         float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
@@ -223,12 +251,40 @@ def identify(
     name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
     figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
     check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,
+    temperature: Annotated[float | None, typer.Option("--temperature", help="Only the pulses at this temperature, degree Celsius.")] = None,
+    branch: Annotated[
+        Branch, typer.Option(help="The OCV after charge, after discharge or in the middle, where the cell has hysteresis.")
+    ] = Branch.MIDDLE,
+    sign: Annotated[
+        Sign | None,
+        typer.Option(help="What a positive current does; unsigned: the voltage tells of each stretch.", show_default="from the file"),
+    ] = None,
+    time_unit: Annotated[
+        str | None, typer.Option("--time-unit", help="s, ms, min, h, hh:mm or mm:ss.", show_default="from the heading")
+    ] = None,
+    current_unit: Annotated[str | None, typer.Option("--current-unit", help="A or mA.", show_default="from the heading")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit a cell's circuit to measured pulses: OCV, R0 and R-C pairs over SOC."""
     from chargetune.cli.identify import identify_command
 
-    identify_command(data, out=out, rc=rc, capacity_Ah=capacity, ocv=ocv, name=name, figure=figure, check=check or [], as_json=as_json)
+    identify_command(
+        data,
+        out=out,
+        rc=rc,
+        capacity_Ah=capacity,
+        ocv=ocv,
+        name=name,
+        figure=figure,
+        check=check or [],
+        temperature_C=temperature,
+        branch=branch.value,
+        sign=None if sign is None else sign.value,
+        units=(time_unit, current_unit),
+        overwrite=overwrite,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -243,6 +299,7 @@ def compare(
     ] = None,
     workers: Workers = 2,
     figure: Annotated[Path | None, typer.Option(help="Figure to write (png, pdf, svg).")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle.
@@ -251,7 +308,9 @@ def compare(
     """
     from chargetune.cli.compare import compare_command
 
-    compare_command(config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, as_json=as_json)
+    compare_command(
+        config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, overwrite=overwrite, as_json=as_json
+    )
 
 
 @app.command()
@@ -278,6 +337,7 @@ def certify(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Certificate to write (.json); traces and figure go beside it.")
     ] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Run the tuned controller on fresh episodes of its range of use and bound the probability of a violation.
@@ -307,6 +367,7 @@ def certify(
         },
         workers=workers,
         output=output,
+        overwrite=overwrite,
         as_json=as_json,
     )
 
@@ -348,12 +409,13 @@ def store_export(
     out: Annotated[Path, typer.Option(help="Folder to write to.", show_default=False)],
     study: Annotated[str | None, typer.Option(help="Name of a study; by default all.")] = None,
     form: Annotated[ExportFormat, typer.Option("--format", help="Kind of table.")] = ExportFormat.PARQUET,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write trials and traces as tables, traces with the column names of the Battery Data Format (needs chargetune[export])."""
     from chargetune.cli.store import export_command
 
-    export_command(store, out=out, study=study, form=form.value, as_json=as_json)
+    export_command(store, out=out, study=study, form=form.value, overwrite=overwrite, as_json=as_json)
 
 
 @store_app.command("migrate")
@@ -366,6 +428,10 @@ def store_migrate(store: StoreArgument) -> None:
 
 # What --debug said, for who reports an error after the command has ended.
 _debug: list[bool] = []
+# The command that runs, for who reports that it was interrupted.
+_command: list[str] = []
+# These keep each trial when it is told.
+RESUMABLE = ("tune", "campaign", "reproduce")
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
@@ -376,10 +442,12 @@ def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the opt
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: ARG001
     debug: Annotated[bool, typer.Option("--debug", help="With an error show where in the program it came from.")] = False,
 ) -> None:
     _debug.append(debug)
+    _command[:] = [context.invoked_subcommand or ""]
 
 
 def main() -> None:
@@ -390,12 +458,12 @@ def main() -> None:
     """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
     try:
-        with handled_interrupts():
+        with handled_interrupts(Watch(_stopping, _interrupted)):
             app()
     except SystemExit as ended:
         # That is what typer makes of KeyboardInterrupt, without a word.
         if ended.code == INTERRUPTED:
-            typer.echo("interrupted; the same command resumes", err=True)
+            _interrupted()
         raise
     except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
         if type(error) is ValueError or isinstance(error, OSError):
@@ -414,6 +482,20 @@ def main() -> None:
         what = f"{type(error).__name__}: {error}"
         typer.echo(f"chargetune: a defect of this program ({what}); please report it with the lines above", err=True)
         sys.exit(DEFECT)
+
+
+def _stopping() -> None:
+    what = "trials that are told are kept" if _resumable() else "what runs is given up"
+    # Whatever stands in the line, a progress bar for instance.
+    typer.echo(f"\nstopping, {what}; a second Ctrl-C ends at once", err=True)
+
+
+def _interrupted() -> None:
+    typer.echo(f"interrupted; the same command {'resumes' if _resumable() else 'begins again'}", err=True)
+
+
+def _resumable() -> bool:
+    return any(name in RESUMABLE for name in _command)
 
 
 def _refuse(error: BaseException) -> NoReturn:

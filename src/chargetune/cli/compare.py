@@ -13,7 +13,8 @@ from chargetune.battery.baselines.comparison import Row, compare, row_names
 from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
-from chargetune.cli.output import console, number, result_line, shown
+from chargetune.cli.output import console, number, result_line, shown, workers_for
+from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
 from chargetune.runtime.interrupts import raise_lost_interrupt
@@ -33,12 +34,16 @@ def compare_command(
     draws: int | None,
     workers: int,
     figure: Path | None,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
         check_format(figure)
     config = load_config(path)
+    if figure is not None:
+        read = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
+        claim([Output("--figure", figure, figure_kind(figure))], inputs=read, overwrite=overwrite, folders=False)
     problem = config.problem(path.parent)
     result = None if store is None else _result(store, study or config.study.name)
     theta = None if result is None or result.trial is None else problem.space.validate(result.trial.theta).tolist()
@@ -52,6 +57,7 @@ def compare_command(
     if draws is not None:
         raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
     names = row_names(problem, theta)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, Row] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -82,13 +88,14 @@ def compare_command(
     if store is None:
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:
-        screen.print(f"figure {figure}")
+        screen.print(f"figure {figure}", markup=False, soft_wrap=True)
 
 
 def _over_range(
     problem: ChargingProblem, theta: list[float] | None, result: StudyResult | None, *, draws: int, seed: int, workers: int, as_json: bool
 ) -> None:
     names = range_row_names(problem, theta)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, RangeRow] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.identification.cycler_files import read_record
-from chargetune.battery.identification.pulse_fit import Identification, cell_toml, identify, predicted_voltage
+from chargetune.battery.identification.cycler_files import Reading, read_record
+from chargetune.battery.identification.current_sign import Sign
+from chargetune.battery.identification.open_circuit import Branch
+from chargetune.battery.identification.pulse_fit import SETS_MIN, Identification, cell_toml, identify, predicted_voltage
+from chargetune.battery.identification.pulses import ZERO_CELSIUS_K, find_pulse_sets, set_temperatures
 from chargetune.battery.identification.record import Record, segments
+from chargetune.battery.identification.thermal import activation_energy
 from chargetune.cli.output import console
+from chargetune.cli.outputs import Kind, Output, claim, figure_kind
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.files import write_whole
 
 __all__ = ["identify_command"]
@@ -32,17 +40,82 @@ def identify_command(
     name: str | None,
     figure: Path | None,
     check: list[Path],
+    temperature_C: float | None,
+    branch: str,
+    sign: str | None,
+    units: tuple[str | None, str | None],
+    overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Fit a cell to measured pulses, write it, and say how well it fits."""
+    """Fit a cell to measured pulses, at each temperature where there are several, write it, and say how well it fits."""
     if figure is not None:
         check_format(figure)
-    slow = None if ocv is None else read_record(ocv)
-    known = [read_record(path) for path in check]
-    found = identify(read_record(data), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
-    checks = [(record.source, *_check(found, record)) for record in known]
-    today = datetime.now().astimezone().date().isoformat()
-    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+    reading = Reading(cast("Sign | None", sign), *units)
+    read = [data, *([] if ocv is None else [ocv]), *check]
+    # Before anything is read: what is one file in the end may not be one that is read.
+    claim(_outputs({None: out}, {None: figure}), inputs=read, overwrite=overwrite)
+    record = read_record(data, reading)
+    at = _temperatures(record, temperature_C)
+    outs, figures = ({t: _with_temperature(path, t) for t in at} for path in (out, figure))
+    if at != [temperature_C]:
+        claim(_outputs(outs, figures), inputs=read, overwrite=overwrite)
+    slow = None if ocv is None else read_record(ocv, reading)
+    known = [read_record(path, reading) for path in check]
+    results = []
+    for t in at:
+        found = identify(
+            record,
+            rc=cast("Literal[1, 2]", rc),
+            capacity_Ah=capacity_Ah,
+            ocv=slow,
+            name=(name or data.stem) + (f" {t:g} degC" if len(at) > 1 else ""),
+            temperature_C=t,
+            branch=cast("Branch", branch),
+        )
+        today = datetime.now().astimezone().date().isoformat()
+        found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+        results.append((t, found, [(one.source, *_check(found, one)) for one in known]))
+    raise_lost_interrupt()
+    for t, found, _ in results:
+        _write(found, cast("Path", outs[t]), figures[t])
+    if as_json:
+        documents = [{"temperature_C": t, "cell": str(outs[t]), **_document(found, checks)} for t, found, checks in results]
+        print(json.dumps(documents[0] if len(documents) == 1 else {"cells": documents}))  # noqa: T201
+        return
+    screen = console()
+    for t, found, checks in results:
+        if len(at) > 1:
+            screen.print(f"{t:g} degC", style="bold")
+        _show(screen, found, checks)
+        drawn = f"\nfigure {figures[t]}" if figures[t] else ""
+        screen.print(f"cell in {outs[t]}{drawn}", markup=False, soft_wrap=True)
+    if len(at) > 1:
+        joules = activation_energy({cast("float", t) + ZERO_CELSIUS_K: found.cell for t, found, _ in results})
+        screen.print(
+            f"R0 + R1 at {', '.join(f'{t:g}' for t in at)} degC: activation energy {1e-3 * joules:.1f} kJ/mol ([thermal] activation_J_mol)",
+            markup=False,
+            soft_wrap=True,
+        )
+    screen.print(f"next: put the limits of its data sheet into it, then chargetune init --cell {outs[at[0]]}", markup=False, soft_wrap=True)
+
+
+def _outputs(outs: Mapping[float | None, Path | None], figures: Mapping[float | None, Path | None]) -> list[Output]:
+    cells = [Output("--output", path, Kind.CELL) for path in outs.values() if path is not None]
+    return cells + [Output("--figure", path, figure_kind(path)) for path in figures.values() if path is not None]
+
+
+def _temperatures(record: Record, chosen: float | None) -> list[float | None]:
+    """The temperatures that get a cell: the chosen one (None where the record has one or none), or each with enough pulses."""
+    levels = [] if chosen is not None else set_temperatures(record, find_pulse_sets(record))
+    enough: list[float | None] = [level for level, sets in levels if len(sets) >= SETS_MIN]
+    return enough if len(levels) > 1 and enough else [chosen]
+
+
+def _with_temperature(path: Path | None, t: float | None) -> Path | None:
+    return path if path is None or t is None else path.with_name(f"{path.stem}_{t:g}degC{path.suffix}")
+
+
+def _write(found: Identification, out: Path, figure: Path | None) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, cell_toml(found.cell, found.remarks))
     # What was written is what a controller will read.
@@ -51,25 +124,31 @@ def identify_command(
         from chargetune.report.figures.identification import identification_figure
         from chargetune.report.figures.style import save
 
+        figure.parent.mkdir(parents=True, exist_ok=True)
         save(identification_figure(replace(found, cell=cell)), figure)
-    if as_json:
-        document: dict[str, Any] = {
-            "points": [{"soc": fit.soc, "rms_mV": 1e3 * fit.rms_V, "values": fit.values, "sd": fit.sd} for fit in found.fits],
-            "seconds": found.seconds,
-            "remarks": list(found.remarks),
-            "checks": [{"file": file, "rate_C": rate, "rms_mV": rms, "worst_mV": worst} for file, rate, rms, worst in checks],
-        }
-        print(json.dumps(document))  # noqa: T201
-        return
-    screen = console()
+
+
+def _document(found: Identification, checks: list[tuple[str, float, float, float]]) -> dict[str, Any]:
+    points = [
+        {"set": fit.number, "soc": fit.soc, "rms_mV": 1e3 * fit.rms_V, "ocv_V": fit.ocv_V, "values": fit.values, "sd": fit.sd}
+        for fit in found.fits
+    ]
+    return {
+        "points": points,
+        "capacity_Ah": found.cell.capacity_Ah,
+        "seconds": found.seconds,
+        "remarks": list(found.remarks),
+        "checks": [{"file": file, "rate_C": rate, "rms_mV": rms, "worst_mV": worst} for file, rate, rms, worst in checks],
+    }
+
+
+def _show(screen: Console, found: Identification, checks: list[tuple[str, float, float, float]]) -> None:
     screen.print(_table(found))
     for remark in found.remarks:
         screen.print(remark, style="dim", markup=False, soft_wrap=True)
     for file, rate, rms, worst in checks:
         line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
         screen.print(line, markup=False, soft_wrap=True)
-    screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
-    screen.print(f"next: put the limits of its data sheet into it, then chargetune init --cell {out}", markup=False, soft_wrap=True)
 
 
 def _check(found: Identification, record: Record) -> tuple[float, float, float]:

@@ -11,12 +11,24 @@ from rich.table import Table
 
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.score import Score
+from chargetune.study.executors import bounded_workers
 from chargetune.study.result import StudyResult
 from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 from chargetune.study.trial import Trial
 
-__all__ = ["beside", "console", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "trials_table"]
+__all__ = [
+    "beside",
+    "console",
+    "metrics_table",
+    "number",
+    "plants_over",
+    "result_line",
+    "shown",
+    "theta_lines",
+    "trials_table",
+    "workers_for",
+]
 
 ROWS = (
     ("overshoot_mV", "worst voltage over the limit", "mV"),
@@ -85,6 +97,14 @@ def plants_over(score: Score | None) -> str:
     """Of a trial over a range of use the drawn plants that broke a limit, "n of N"; a dash for any other trial."""
     drawn = {} if score is None else score.metrics
     return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
+
+
+def workers_for(wanted: int, work: int, what: str) -> int:
+    """The number of worker processes; where fewer than wanted can have something to do, one line on stderr says so."""
+    count, said = bounded_workers(wanted, work, what)
+    if said:
+        console(stderr=True).print(f"--{said}", markup=False, soft_wrap=True)
+    return count
 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:

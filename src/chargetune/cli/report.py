@@ -6,8 +6,9 @@ import json
 from pathlib import Path
 
 from chargetune.cli.output import beside, console, shown
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
-from chargetune.report import read_study, save_figures
+from chargetune.report import figure_names, read_study, save_figures
 from chargetune.report.page.page import report_page
 from chargetune.report.study_view import read_studies
 from chargetune.study.files import write_whole
@@ -15,7 +16,9 @@ from chargetune.study.files import write_whole
 __all__ = ["report_command"]
 
 
-def report_command(location: str, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, as_json: bool) -> None:
+def report_command(
+    location: str, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, overwrite: bool, as_json: bool
+) -> None:
     """Write the page, and with ``figures`` the figures of a paper."""
     if study is None:
         names = [view.name for view in read_studies(location)]
@@ -23,9 +26,11 @@ def report_command(location: str, *, study: str | None, out: Path | None, figure
             raise ValueError(f"{shown(location)} has {len(names)} studies, choose one by --study: {', '.join(names) or '(none)'}")
         study = names[0]
     target = out or beside(location, ".html")
-    if not target.parent.is_dir():
-        raise ValueError(f"--output {target}: there is no folder {target.parent}")
+    page = Output("page" if out is None else "--output", target, Kind.PAGE)
+    claim([page], inputs=[location], overwrite=overwrite, folders=False)
     view = read_study(location, study)
+    vectors = [] if figures is None else [Output("--figures", figures / f"{stem}.pdf", Kind.PDF) for stem in figure_names(view)]
+    claim([page, *vectors], inputs=[location], overwrite=overwrite)
     with bar(quiet=as_json) as progress:
         task = progress.add_task("sensitivities", total=view.space.dimension, note="")
         write_whole(target, report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task)))
@@ -34,4 +39,4 @@ def report_command(location: str, *, study: str | None, out: Path | None, figure
     if as_json:
         print(json.dumps({"study": study, "page": str(target), "figures": [str(f) for f in drawn]}))  # noqa: T201
         return
-    console().print(f"page {target}" + "".join(f"\nfigure {f}" for f in drawn))
+    console().print(f"page {target}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)

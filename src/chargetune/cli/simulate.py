@@ -15,6 +15,7 @@ from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console, metrics_table
+from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["parse_theta", "simulate_command"]
 
@@ -25,6 +26,7 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
     problem = config.problem(path.parent)
     values = problem.theta_values if theta is None else parse_theta(theta, problem, "--theta")
     episode = run_charge(problem, values, seed)
+    raise_lost_interrupt()
     if not len(episode):
         raise ValueError(f"the episode has no interval; it ended with {episode.ending.value}: {episode.message}")
     score = score_episode(problem, episode)

@@ -22,7 +22,8 @@ from chargetune.battery.charging.verdict import charge_time, violation_mVs
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines
+from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines, workers_for
+from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
@@ -58,30 +59,35 @@ def tune_command(
     as_json: bool,
     force: bool = False,
     accept_changed: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Tune, show the way there, and say what came of it. An error of the formulation stops before the first trial, unless ``force``."""
     config = load_config(path)
     if seed is not None:
         config = config.model_copy(update={"study": config.study.model_copy(update={"seed": seed})})
     count = config.study.trials if trials is None else trials
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     kept = store or str(out / "study.sqlite" if out else f"{path.stem}.sqlite")
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
+    outputs = [] if "://" in kept else [Output("store", Path(kept), Kind.STORE, renewed=True)]
+    if out is not None:
+        outputs += _files(out, config, problem, kept)
+    claim(outputs, inputs=read_by(path, config.model_dump()), overwrite=overwrite)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
     _check(problem, problem.safe_start, force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
     everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
+    summary = {**_summary(config, everything, result, problem.space.entries), "store": shown(kept)}
+    summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
 
-        figures = save_figures(kept, config.study.name, out, trials=count)
-    summary = _summary(config, everything, result, problem.space.entries)
-    summary |= {"safety": safety} if safety else {}
-    if out is not None:
+        # First what says whose folder this is.
         write_whole(out / "summary.json", json.dumps(summary, indent=1))
+        figures = save_figures(kept, config.study.name, out, trials=count)
     if as_json:
         print(json.dumps(summary))  # noqa: T201
         _end(safety, everything)
@@ -93,6 +99,21 @@ def tune_command(
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
     console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
     _end(safety, everything)
+
+
+def _files(out: Path, config: Config, problem: ChargingProblem, kept: str) -> list[Output]:
+    """What is written into ``out``. Where an earlier run of this study wrote there, the same command renews it."""
+    summary = out / "summary.json"
+    try:
+        found = json.loads(summary.read_text(encoding="utf-8"))
+        own = (found["study"], found.get("store", shown(kept))) == (config.study.name, shown(kept))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        own = False
+    tuned = problem.theta
+    stems = ["trajectories", "convergence", *tuned.ratios]
+    stems += [name for name, table in (("backoff", tuned.backoff), ("current_limit", tuned.current_limit)) if table is not None]
+    figures = [Output("--out", out / f"{stem}.png", Kind.PNG, renewed=own) for stem in stems]
+    return [Output("--out", summary, Kind.JSON, renewed=own), *figures]
 
 
 @dataclass(frozen=True)
@@ -113,9 +134,14 @@ def _run(
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
         study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed))
-        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
+        # Without batches more workers have something to do only if the order of the trials is given up for them; and
+        # not with a tuner whose every step needs the trial before it.
+        alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
+        at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
+        workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
         if study.earlier and not quiet:
@@ -136,9 +162,6 @@ def _run(
 
         stopped = ""
         try:
-            # Without batches more workers have something to do only if the order of the trials is given up for them; and
-            # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
             ahead = workers if workers > 1 and not alone else None
             study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:

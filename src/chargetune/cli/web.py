@@ -6,6 +6,7 @@ import contextlib
 import socket
 
 from chargetune.cli.output import console
+from chargetune.runtime.interrupts import unwatched
 from chargetune.study.store.store import Store
 
 __all__ = ["web_command"]
@@ -34,12 +35,12 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
             log_level="warning",
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=3,
+            timeout_graceful_shutdown=2,
         )
         server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
         console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
         # uvicorn passes Ctrl-C on once it has ended in good order.
-        with contextlib.suppress(KeyboardInterrupt):
+        with contextlib.suppress(KeyboardInterrupt), unwatched():
             server.run(sockets=[listening])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
@@ -21,7 +22,7 @@ from chargetune.model.parameter_space import ParameterSpace
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.dataframe import study_html, trials_dataframe
 from chargetune.study.evaluation import Evaluate, trial_seed
-from chargetune.study.executors import process_executor
+from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
@@ -261,7 +262,8 @@ class Study:
             None: batch after batch, each when the one before it is told; the trials depend on nothing but the study. A number:
             so many trials are under way at once, and as soon as one is told the next theta is proposed, with those under way as
             pending points. One worker gives the trials of a study in batches of 1; with more they depend on the order in which
-            evaluations end. Each trial's provenance says which were ``pending`` when it was proposed.
+            evaluations end. Each trial's provenance says which were ``pending`` when it was proposed. Without an executor there are
+            not more than cores of this machine and trials left; a larger number is lowered with a warning.
         attempts
             A trial whose worker was lost is evaluated again until so many workers were lost by it; then it has failed. Losses are
             counted in the store. With 1, and always on hardware, nothing is repeated: a trial that was begun and is not told stops
@@ -297,10 +299,14 @@ class Study:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} = {value!r}, allowed is an integer >= 1")
         with ExitStack() as stack:
+            known = self.trials()
             if executor is None and workers is not None:
+                told = sum(t.status is not TrialStatus.RUNNING for t in known)
+                workers, said = bounded_workers(workers, max(1, trials - told))
+                if said:
+                    warnings.warn(said, RuntimeWarning, stacklevel=2)
                 executor = stack.enter_context(process_executor(workers))
             check_crosses(evaluate, executor)
-            known = self.trials()
             if isinstance(progress, bool):
                 progress = stack.enter_context(progress_bar(known, trials)) if progress else None
             tally = Tally(known, progress)

@@ -52,6 +52,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
             signs=signs,
             finer=finer,
             quick=quick,
+            along="soc",
         )
     )
     if any(finding.code == "unsafe-start" for finding in found):

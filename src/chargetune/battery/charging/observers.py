@@ -26,6 +26,8 @@ __all__ = ["Adaptive", "OffsetFree", "observer_filter", "observer_model", "setti
 MINUTE_S = 60.0
 # Newton steps from the inverse table to the SOC at which the OCV is the voltage at rest: error below 1e-4.
 NEWTON_STEPS = 2
+# An OCV that rises by less from empty to full (V) is flat there (LFP), and a Newton step would leave it on a millivolt of noise.
+FLAT_V = 0.02
 RESISTANCE_FACTOR = "resistance_factor"
 
 
@@ -216,13 +218,16 @@ def _per_charge(p: Named, u: Named, name: str, sampling_time_s: float) -> Any:
 
 def _soc_at_rest(y: Mapping[str, Any], _: Named, cell: Cell) -> dict[str, Any]:
     """The SOC whose OCV is the voltage at rest, within 0 and 1: from the inverse table by Newton steps on the table itself."""
-    voltage = ca.fmin(ca.fmax(y["voltage_V"], cell.ocv_V[0]), cell.ocv_V[-1])
+    # Where the table is flat the voltage tells no SOC but that it is in there: its middle.
+    volts = sorted(set(cell.ocv_V))
+    middles = [float(np.mean([z for z, v in zip(cell.ocv_soc, cell.ocv_V, strict=True) if v == value])) for value in volts]
+    voltage = ca.fmin(ca.fmax(y["voltage_V"], volts[0]), volts[-1])
     z = ca.SX.sym("z")
     ocv = pchip(z, cell.ocv_soc, cell.ocv_V)
     step = ca.Function("newton", [z], [ocv, ca.jacobian(ocv, z)])
-    soc = pchip(voltage, cell.ocv_V, cell.ocv_soc)
+    soc = pchip(voltage, volts, middles)
     for _step in range(NEWTON_STEPS):
         value, slope = step(soc)
-        soc = ca.fmin(ca.fmax(soc + (voltage - value) / ca.fmax(slope, 1e-3), 0.0), 1.0)
+        soc = ca.fmin(ca.fmax(soc + (voltage - value) / ca.fmax(slope, FLAT_V), 0.0), 1.0)
     # A sample that is lost says nothing: fmin and fmax would drop the nan.
     return {"soc": ca.if_else(ca.fabs(y["voltage_V"]) < math.inf, soc, ca.SX.nan())}

@@ -109,6 +109,15 @@ class ChargingProblem:
             own = self.estimator.settings.voltage_sd_V
             check_number("kalman: voltage_sd_V", own, theta.voltage_sd.lower_V, theta.voltage_sd.upper_V, "V, which theta.voltage_sd spans")
 
+        ramp = self.controller.current_ramp_A_s
+        if theta.current_ramp is not None:
+            low, high = theta.current_ramp.lower_A_s, theta.current_ramp.upper_A_s
+            if ramp is None:
+                raise ValueError(
+                    "theta.current_ramp is given without controller.current_ramp_A_s, allowed is the untuned ramp there, "
+                    f"in [{low:g}, {high:g}] A/s"
+                )
+            check_number("controller: current_ramp_A_s", ramp, low, high, "A/s, which theta.current_ramp spans")
         numbers = self._observer_numbers
         for part in theta.observer:
             if part.name not in numbers or isinstance(self.estimator.settings, Kalman):
@@ -173,7 +182,7 @@ class ChargingProblem:
     @property
     def space(self) -> ParameterSpace:
         """The space of theta."""
-        return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()))
+        return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()), self.controller.current_ramp_A_s)
 
     @property
     def _observer_numbers(self) -> dict[str, float]:
@@ -196,8 +205,8 @@ class ChargingProblem:
 
 
 @built_once(64)
-def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...]) -> ParameterSpace:
-    return theta.space(nodes, dict(observer))
+def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...], ramp_A_s: float | None) -> ParameterSpace:
+    return theta.space(nodes, dict(observer), ramp_A_s)
 
 
 def with_feedback(problem: ChargingProblem) -> ChargingProblem:

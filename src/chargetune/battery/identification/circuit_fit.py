@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from chargetune.battery.cell.cell import RESISTANCE_MAX_V
 from chargetune.battery.identification.pulses import PulseSet, rest_level
 from chargetune.battery.identification.record import JUMP_SHARE, Record
 from chargetune.battery.identification.spikes import spikes
@@ -17,8 +18,8 @@ __all__ = ["PulseFit", "fit_set"]
 
 # Time constants that pulses of some ten seconds can tell, s: the first pair, and both where there are two.
 TIME_CONSTANTS_S = {1: ((0.5, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
-# Volts at 1C, which do not depend on how large a cell is: of 3 Ah, 0.1 micro-ohm to 1 ohm.
-RESISTANCES_V = (3e-7, 3.0)
+# Least and largest voltage of a resistance at 1C.
+RESISTANCES_V = (1e-6, RESISTANCE_MAX_V)
 # A standard deviation of more than this share says that the data do not hold the parameter.
 SPREAD_MAX = 1.0
 GRID = 12

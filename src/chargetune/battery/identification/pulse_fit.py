@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from chargetune.battery.cell.cell import CAPACITY_MAX_AH, VOLTAGE_ABOVE_FULL_V, Cell
+from chargetune.battery.cell.cell import CAPACITY_MAX_AH, Cell, highest_voltage
 from chargetune.battery.cell.equivalent_circuit import ecm_model
 from chargetune.battery.identification.circuit_fit import PulseFit, fit_set
 from chargetune.battery.identification.fit_remarks import remarks_on, without_spikes
@@ -32,7 +32,7 @@ from chargetune.battery.identification.pulses import (
 from chargetune.battery.identification.record import Record, segments
 from chargetune.battery.validation import check_number
 
-__all__ = ["Identification", "PulseFit", "cell_toml", "identify", "predicted_voltage"]
+__all__ = ["SETS_MIN", "Identification", "PulseFit", "cell_toml", "identify", "predicted_voltage"]
 
 # Sets of pulses that a table over SOC takes.
 SETS_MIN = 3
@@ -181,7 +181,7 @@ def _cell(
         coulombic_efficiency=1.0,
         current_max_A=float(np.max(np.abs(record.current_A[within]))),
         voltage_min_V=round(min(lowest, float(ocv[1][0])), 3),
-        voltage_max_V=min(highest, np.floor(1e3 * (ocv[1][-1] + VOLTAGE_ABOVE_FULL_V)) / 1e3),
+        voltage_max_V=min(highest, np.floor(1e3 * highest_voltage(float(ocv[1][-1]))) / 1e3),
         soc=tuple(float(np.mean([ordered[i].soc for i in group])) for group in near),
         ocv_soc=tuple(float(z) for z in ocv[0]),
         ocv_V=tuple(float(v) for v in ocv[1]),

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config, read_tables
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.result import Reason, StudyResult, read_result
 from chargetune.study.store.store import Store, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
@@ -136,6 +137,7 @@ def run_campaign(
                 entry = queue.popleft()
                 turns[executor.submit(_turn, entry, store)] = entry
             finished, _ = wait(turns, return_when=FIRST_COMPLETED)
+            raise_lost_interrupt()
             for future in finished:
                 entry = turns.pop(future)
                 standing = _standing(future, entry, store, losses)

@@ -139,7 +139,8 @@ class Config(_Table):
         if isinstance(settings, (OffsetFree, Adaptive)):
             # Defaults may change; what decides the trials does not.
             data["estimator"][str(self.estimator.kind)] = asdict(settings)
-        for table, name in (("controller", "current_ramp_A_s"), ("theta", "observer"), *(("estimator", name) for name in FILTERS)):
+        absent = (("controller", "current_ramp_A_s"), ("theta", "observer"), ("theta", "current_ramp"))
+        for table, name in (*absent, *(("estimator", name) for name in FILTERS)):
             if not data[table][name]:
                 del data[table][name]
         return data | _as_recorded(data)
