@@ -67,7 +67,7 @@ lock: ## renew requirements.lock from the ranges in pyproject.toml
 	rm -rf $(LOCK_VENV)
 	$(PYTHON) -m venv $(LOCK_VENV)
 	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)"
-	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench,dask,export,gym,notebook,postgres,pybamm,web]'
+	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench,dask,excel,export,gym,notebook,postgres,pybamm,web]'
 	{ grep '^#' requirements.lock; \
 	  $(LOCK_VENV)/bin/pip freeze --all --exclude-editable --exclude pip \
 	  | sed 's/+cpu$$//' | grep -Ev '^(cuda|nvidia|triton)'; } > build/requirements.lock

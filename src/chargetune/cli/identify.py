@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.identification.cycler_files import Reading, read_record
 from chargetune.battery.identification.current_sign import Sign
+from chargetune.battery.identification.cycler_files import Reading, read_record
 from chargetune.battery.identification.open_circuit import Branch
 from chargetune.battery.identification.pulse_fit import SETS_MIN, Identification, cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.pulses import ZERO_CELSIUS_K, find_pulse_sets, set_temperatures

@@ -13,6 +13,8 @@ __all__ = ["DateTimes", "clock_seconds", "dates", "decimal_mark", "number"]
 
 # 12:34:56.7 with days before it: "0d 00:00:05.1", "1-02:03:04", "1.02:03:04", "1 day, 02:03:04".
 CLOCK = re.compile(r"([-+])?(?:(\d+)\s*(?:d|days?)?\s*[-.,\s]\s*)?(\d+):(\d\d?):(\d\d?(?:[.,]\d+)?)", re.IGNORECASE)
+# Days or milliseconds beside hours, minutes and seconds: which of them, the unit says or a decimal mark shows.
+LONG_CLOCK = re.compile(r"(\d+):(\d\d?):(\d\d?):(\d+(?:[.,]\d+)?)")
 SHORT_CLOCK = re.compile(r"(\d+):(\d\d?(?:[.,]\d+)?)")
 THOUSANDS = {mark: re.compile(rf"[-+]?\d{{1,3}}(?:\{mark}\d{{3}})+") for mark in ",."}
 DATE = re.compile(
@@ -65,14 +67,21 @@ def number(cell: str, mark: str) -> float:
 
 
 def clock_seconds(cell: str, unit: str) -> float | None:
-    """Seconds of a clock with hours, minutes and seconds; None for no clock. Two parts only where the unit says what they are.
+    """Seconds of a clock with hours, minutes and seconds; None for no clock. Two or four parts only where it is clear what they are.
 
-    Raises ValueError for two parts of unknown meaning.
+    Raises ValueError for parts of unknown meaning.
     """
     if match := CLOCK.fullmatch(cell.strip()):
         sign, days, hours, minutes, seconds = match.groups()
         value = 86400.0 * int(days or 0) + 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
         return -value if sign == "-" else value
+    if match := LONG_CLOCK.fullmatch(cell.strip()):
+        first, second, third, last = (float(part.replace(",", ".")) for part in match.groups())
+        if unit.startswith("d") or "." in match[4] or "," in match[4]:
+            return 86400.0 * first + 3600.0 * second + 60.0 * third + last
+        if unit.startswith("h"):
+            return 3600.0 * first + 60.0 * second + third + 1e-3 * last
+        raise ValueError("h:mm:ss; four parts can be d:hh:mm:ss or hh:mm:ss:ms (--time-unit d:hh:mm:ss or hh:mm:ss:ms decides)")
     if match := SHORT_CLOCK.fullmatch(cell.strip()):
         first, second = float(match[1]), float(match[2].replace(",", "."))
         if unit.startswith("m"):

@@ -157,8 +157,8 @@ class _Circuit:
                 # A resistance without bound is an OCV that is not what the rests say, as beside a knee.
                 help_ = "an OCV from a slow charge and discharge (--ocv)" if label[0] == "R" else "longer pulses"
                 raise ValueError(
-                    f"{self.place}: the data do not hold {label}; its fit ends at {np.exp(x[i]):.3g}, allowed is {least:.3g} to {most:.3g}; "
-                    f"{'faster sampling' if low else help_}{fewer} would"
+                    f"{self.place}: the data do not hold {label}; its fit ends at {np.exp(x[i]):.3g}, allowed is "
+                    f"{least:.3g} to {most:.3g}; {'faster sampling' if low else help_}{fewer} would"
                 )
             if not spread[i] <= SPREAD_MAX:
                 raise ValueError(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.identification.record import JUMP_SHARE
 
-__all__ = ["Clock", "elapsed"]
+__all__ = ["DAY_S", "Clock", "elapsed"]
 
 DAY_S = 86400.0
 # A clock of the whole test that restarts begins at most here, s, or at most at this share of the time before.
@@ -40,8 +40,8 @@ class Clock:
     def changes(self) -> NDArray[np.bool_]:
         """Whether a step may begin with each sample after the first: its number changes or, without one, the current jumps."""
         if self.step is not None:
-            return np.diff(self.step) != 0
-        return np.abs(np.diff(self.current_A)) > JUMP_SHARE * np.max(np.abs(self.current_A))
+            return np.asarray(np.diff(self.step) != 0)
+        return np.asarray(np.abs(np.diff(self.current_A)) > JUMP_SHARE * np.max(np.abs(self.current_A)))
 
 
 def elapsed(name: str, clock: Clock, remarks: list[str]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -55,6 +55,7 @@ def elapsed(name: str, clock: Clock, remarks: list[str]) -> tuple[NDArray[np.flo
     for k in falls.tolist():
         if used.of_day and _midnight(time, k):
             steps[k] += DAY_S
+            falls = falls[falls != k]
             continue
         # Of a step's clock every fall is a step's begin; another clock begins near zero again, or it is damaged.
         allowed = time[k] if of_steps else max(RESTART_S, min(RESTART_SHARE * time[k], RESTART_MAX_S))
@@ -90,7 +91,8 @@ def _without_glitches(clock: Clock, remarks: list[str]) -> NDArray[np.bool_]:
             if 0 < across <= GLITCH_INTERVALS * before:
                 keep[wrong] = False
                 remarks.append(
-                    f"sample {wrong + 1} was left out: its time is {time[wrong]:g} s, between {time[wrong - 1]:g} s and {time[wrong + 1]:g} s"
+                    f"sample {wrong + 1} was left out: its time is {time[wrong]:g} s, between {time[wrong - 1]:g} s and "
+                    f"{time[wrong + 1]:g} s"
                 )
                 break
     return keep

@@ -46,7 +46,7 @@ def signed_by_state(name: str, current: NDArray[np.float64], states: Sequence[st
                     f"{name}, sample {k + 1}: a current of {current[k]:g} A without a sign in the state {states[k]!r}; "
                     "allowed are states that charge or discharge (--sign decides)"
                 )
-            sign[lost] = [sign[max(i - 1, 0)] or sign[min(i + 1, sign.size - 1)] for i in np.flatnonzero(lost)]
+            sign[lost] = [sign[max(i - 1, 0)] or sign[min(i + 1, sign.size - 1)] for i in np.flatnonzero(lost).tolist()]
         else:
             return current
     signed = np.where(sign == 0, 1, sign) * np.abs(current)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.identification.cells import clock_seconds, dates, decimal_mark, number
-from chargetune.battery.identification.clocks import Clock, elapsed
+from chargetune.battery.identification.clocks import DAY_S, Clock, elapsed
 from chargetune.battery.identification.current_sign import Sign, signed_by_state
 from chargetune.battery.identification.headings import Column, unit_of
 from chargetune.battery.identification.layouts import NEEDED, UNITS
@@ -26,11 +26,15 @@ from chargetune.battery.identification.samples import Samples, read_samples
 
 __all__ = ["Reading", "read_record"]
 
+# Clocks that can be read in two ways.
+CLOCKS = ("hh:mm", "mm:ss", "d:hh:mm:ss", "hh:mm:ss:ms")
 ZERO_CELSIUS_K = 273.15
 # A temperature column beyond these, degree Celsius, is no cell's; one without a unit that stays within the others is in kelvin.
 CELSIUS_RANGE, KELVIN_RANGE = (-80.0, 200.0), (223.0, 400.0)
 # Without a unit a voltage beyond this is in mV, and a current beyond this may be in mA.
 MILLIVOLTS_FROM, AMPERES_TO = 100.0, 100.0
+# How a remark calls the order of a date.
+ORDERS = {"ymd": "year, month, day", "mdy": "month, day, year", "dmy": "day, month, year"}
 # Dates and clock of one file differ by less than this share.
 DATES_SHARE = 0.02
 
@@ -48,8 +52,8 @@ class Reading:
             raise ValueError(f"sign = {self.sign!r}, allowed are charge, discharge and unsigned")
         for name, quantity in (("time_unit", "time"), ("current_unit", "current")):
             unit = getattr(self, name)
-            if unit is not None and unit_of(unit) not in {*UNITS[quantity], "hh:mm", "mm:ss"} - {""}:
-                allowed = "s, ms, min, h, d, hh:mm and mm:ss" if quantity == "time" else "A, mA and uA"
+            if unit is not None and unit_of(unit) not in ({*UNITS[quantity], *CLOCKS} if quantity == "time" else {*UNITS[quantity]}) - {""}:
+                allowed = "s, ms, min, h, d, hh:mm, mm:ss, d:hh:mm:ss and hh:mm:ss:ms" if quantity == "time" else "A, mA and uA"
                 raise ValueError(f"{name} = {unit!r}, allowed are {allowed}")
 
 
@@ -132,9 +136,7 @@ def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remar
             order, seconds = moments.best()
         except ValueError as error:
             raise ValueError(f"{samples.name}: {column.heading} = {cells[0]!r} to {cells[-1]!r}, allowed are {error}") from None
-        remarks.append(
-            f"time is from the dates in {column.heading} ({ {'ymd': 'year, month, day', 'mdy': 'month, day, year', 'dmy': 'day, month, year'}[order] })"
-        )
+        remarks.append(f"time is from the dates in {column.heading} ({ORDERS[order]})")
         return seconds, False
     values, clocks = [], 0
     for row, cell in zip(samples.numbers, cells, strict=True):
@@ -203,7 +205,9 @@ def _compared(
     if source == "date" or "date" not in columns or not time[-1]:
         return
     moments = dates([cell for cell, kept in zip(samples.cells["date"], keep, strict=True) if kept])
-    spans = [] if moments is None else [float(seconds[-1]) for seconds in moments.by_order.values() if np.all(np.diff(seconds) >= 0)]
+    found = [] if moments is None else [seconds for seconds in moments.by_order.values() if np.all(np.diff(seconds) >= 0)]
+    # A date alone, without the time of day, tells nothing.
+    spans = [float(seconds[-1]) for seconds in found if np.any(seconds % DAY_S)]
     if not spans:
         return
     span = min(spans, key=lambda seconds: abs(seconds - time[-1]))

@@ -42,13 +42,18 @@ def unit_of(text: str) -> str:
 
 def columns_of(row: Sequence[str]) -> tuple[dict[str, Column], dict[str, list[Column]], list[str]]:
     """(columns by quantity, further candidates of each, headings known by name in a unit that is not)."""
-    ranked: dict[str, list[tuple[int, Column]]] = {}
+    ranked: dict[str, list[tuple[float, Column]]] = {}
     odd: list[str] = []
     for index, cell in enumerate(row):
         label, unit, known = _parsed(cell)
         found = False
         for quantity, names in NAMES.items():
-            if label not in names:
+            # Sensors are numbered; of several the first one with the best name is taken.
+            if quantity == "temperature" and label not in names:
+                label_, number = re.sub(r"\d+$", "1", label), True
+            else:
+                label_, number = label, False
+            if label_ not in names:
                 continue
             units = UNITS.get(quantity)
             if units is not None and unit not in units and not (quantity in CLOCKS and ":" in unit):
@@ -60,7 +65,7 @@ def columns_of(row: Sequence[str]) -> tuple[dict[str, Column], dict[str, list[Co
             # "Amps" and "Volts" are their own unit.
             own = label if units is not None and not unit and label in units else unit
             column = Column(index, cell.strip(), quantity, own if units is not None else "")
-            ranked.setdefault(quantity, []).append((names.index(label), column))
+            ranked.setdefault(quantity, []).append((names.index(label_) + 0.5 * number, column))
         if not found and any(label in NAMES[quantity] for quantity in NEEDED):
             odd.append(cell.strip())
     chosen, others = {}, {}

@@ -52,7 +52,8 @@ LAYOUTS: tuple[Layout, ...] = (
         "Arbin", "Test_Time(s)", "Current(A)", "Voltage(V)", "Aux_Temperature_1(C)", "Step_Index", others=("Data_Point", "Cycle_Index")
     ),
     Layout(
-        "Arbin, newer", "Test Time (s)", "Current (A)", "Voltage (V)", "Temperature (C)_1", "Step Index", others=("Date Time", "Cycle Index")
+        "Arbin, newer", "Test Time (s)", "Current (A)", "Voltage (V)", "Temperature (C)_1", "Step Index", others=("Date Time",
+        "Cycle Index")
     ),
     Layout(
         "Neware, general", "Total Time", "Current(mA)", "Voltage(V)", "T1(℃)", "Step Index", "Step Type", ("Rest", "CC Chg", "CC DChg"),
@@ -77,7 +78,8 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
     Layout(
         "Maccor, text", "TestTime", "Amps", "Volts", "Temp 1", "Step", "State", ("R", "C", "D"), others=("Rec#", "Cyc#"), separator="\t",
-        suffix=".txt", clock="days", signed=False, before=("Today's Date:\t06 May 2024\tDate of Test:\t06 May 2024", "Procedure:\tmade.000"),
+        suffix=".txt", clock="days", signed=False, before=("Today's Date:\t06 May 2024\tDate of Test:\t06 May 2024",
+        "Procedure:\tmade.000"),
     ),
     Layout(
         "Maccor, CSV", "Test Time (Sec)", "Current (A)", "Voltage (V)", step="Step", state="MD", states=("R", "C", "D"),
@@ -88,7 +90,8 @@ LAYOUTS: tuple[Layout, ...] = (
         others=("Cycle", "Loop Counter #1"), clock="clock",
     ),
     Layout(
-        "Digatron", "Prog Time", "Current", "Voltage", "Temperature", "Step", "Status", ("PAU", "CHA", "DCH"), others=("Cycle", "Procedure"),
+        "Digatron", "Prog Time", "Current", "Voltage", "Temperature", "Step", "Status", ("PAU", "CHA", "DCH"), others=("Cycle",
+        "Procedure"),
         units=("[A]", "[V]", "[C]"), clock="clock", before=("", "", "Measurement ID,1", "Nominal Capacity, 3", ""),
     ),
     Layout(
@@ -107,12 +110,14 @@ LAYOUTS: tuple[Layout, ...] = (
         "Landt", "TestTime/Sec.", "Current/mA", "Voltage/V", step="Step-Index", others=("Record", "Cycle-Index"), separator="\t",
         suffix=".txt",
     ),
-    Layout("BDF, labels", "Test Time / s", "Current / A", "Voltage / V", "Surface Temperature T1 / degC", "Step Index / 1", suffix=".bdf.csv"),
+    Layout("BDF, labels", "Test Time / s", "Current / A", "Voltage / V", "Surface Temperature T1 / degC", "Step Index / 1",
+    suffix=".bdf.csv"),
     Layout("BDF, names", "test_time_second", "current_ampere", "voltage_volt", "surface_temperature_t1_celsius", suffix=".bdf.csv"),
     Layout("BDF, Parquet", "Test Time / s", "Current / A", "Voltage / V", "Ambient Temperature / degC", suffix=".bdf.parquet"),
     Layout("XLSX, Arbin", "Test_Time(s)", "Current(A)", "Voltage(V)", step="Step_Index", others=("Date_Time",), suffix=".xlsx"),
     Layout(
-        "XLSX, Neware", "Total Time", "Current(A)", "Voltage(V)", step="Step Index", state="Step Type", states=("Rest", "CC Chg", "CC DChg"),
+        "XLSX, Neware", "Total Time", "Current(A)", "Voltage(V)", step="Step Index", state="Step Type", states=("Rest", "CC Chg",
+        "CC DChg"),
         others=("DataPoint",), clock="clock", suffix=".xlsx",
     ),
     Layout("Underscores", "Time_s", "Current_A", "Voltage_V", "Temperature_degC"),
@@ -124,7 +129,7 @@ LAYOUTS: tuple[Layout, ...] = (
 NAMES: dict[str, tuple[str, ...]] = {
     "time": (
         "testtime", "totaltime", "progtime", "runtime", "elapsedtime", "cumulativetime", "experimenttime", "timesincestart", "recordtime",
-        "time", "t", "totalzeit", "zeit", "总时间", "测试时间",
+        "time", "t", "unixtime", "epochtime", "epoch", "totalzeit", "zeit", "总时间", "测试时间",
     ),
     "step": ("stepindex", "stepid", "stepnumber", "stepno", "step", "ns", "line", "stepcount", "stepindex1", "工步号", "工步序号"),
     "step_time": ("steptime", "relativetime", "tstep", "stepduration", "相对时间", "时间"),
@@ -133,7 +138,8 @@ NAMES: dict[str, tuple[str, ...]] = {
         "系统时间",
     ),
     "current": (
-        "cellcurrent", "batterycurrent", "current", "cur", "i", "amps", "amp", "ampere", "amperes", "ibat", "ibatt", "icell", "strom", "电流",
+        "cellcurrent", "batterycurrent", "current", "cur", "i", "amps", "amp", "ampere", "amperes", "ibat", "ibatt",
+        "icell", "strom", "电流",
     ),
     "voltage": (
         "eweece", "ecell", "cellvoltage", "vcell", "ucell", "terminalvoltage", "batteryvoltage", "voltage", "volts", "volt", "vol",
@@ -160,6 +166,7 @@ UNITS: dict[str, dict[str, float]] = {
         "ua": 1e-6, "microampere": 1e-6, "ka": 1e3,
     },
     "voltage": {"": 1.0, **dict.fromkeys(("v", "volt", "volts"), 1.0), "mv": 1e-3, "millivolt": 1e-3, "uv": 1e-6, "microvolt": 1e-6},
-    "temperature": {"": 1.0, **dict.fromkeys(("c", "degc", "celsius", "degreec", "oc"), 1.0), "k": 1.0, "kelvin": 1.0, "f": 1.0, "degf": 1.0},
+    "temperature": {"": 1.0, **dict.fromkeys(("c", "degc", "celsius", "degreec", "oc"), 1.0), "k": 1.0, "kelvin": 1.0, "f": 1.0,
+    "degf": 1.0},
 }  # fmt: skip
 UNITS["step_time"], UNITS["counter"] = UNITS["time"], UNITS["voltage"]

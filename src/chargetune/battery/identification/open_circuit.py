@@ -158,7 +158,8 @@ def ocv_from_slow(
     else:
         between = v_c if branch == "charge" else v_d
         remarks.append(
-            f"OCV is the {branch} in {ocv.source}, with its polarisation; charge and discharge lie {1e3 * np.median(v_c - v_d):.0f} mV apart"
+            f"OCV is the {branch} in {ocv.source}, with its polarisation; charge and discharge lie "
+            f"{1e3 * np.median(v_c - v_d):.0f} mV apart"
         )
     if rate > SLOW_MAX or apart > OCV_SPREAD_V:
         remarks.append(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.identification.current_sign import Sign, with_sign
-from chargetune.battery.identification.record import Record, segments
+from chargetune.battery.identification.record import Record
 
 __all__ = ["checked"]
 
@@ -70,7 +70,10 @@ def _without_offset(record: Record) -> Record:
     if not told:
         return record
     if not same or max(spread for _, spread in levels) > max(abs(zero), SAME_LEVEL * largest):
-        note = f"the current reads {1e3 * values.min():.3g} to {1e3 * values.max():.3g} mA in its {len(levels)} rests: if that is the sensor's zero, the counted charge is wrong"
+        note = (
+            f"the current reads {1e3 * values.min():.3g} to {1e3 * values.max():.3g} mA in its {len(levels)} rests: if that is the "
+            "sensor's zero, the counted charge is wrong"
+        )
         return replace(record, remarks=(*record.remarks, note))
     note = f"the current reads {1e3 * zero:.4g} mA in each of its {len(levels)} rests; it was subtracted from every sample"
     return replace(record, current_A=record.current_A - zero, remarks=(*record.remarks, note))

@@ -82,8 +82,8 @@ def unused_pulses(record: Record, sets: list[PulseSet], soc: NDArray[np.float64]
         of = [pair for pair in short if abs(pair[0] - short[0][0]) <= SAME_SOC]
         short = [pair for pair in short if pair not in of]
         notes.append(
-            f"{len(of)} pulse{'s' if len(of) > 1 else ''} at SOC {of[0][0]:.2f} left out: the rest before lasted {of[0][1]:.0f} s, needed are "
-            f"{REST_MIN_S:g} s"
+            f"{len(of)} pulse{'s' if len(of) > 1 else ''} at SOC {of[0][0]:.2f} left out: the rest before lasted {of[0][1]:.0f} s, "
+            f"needed are {REST_MIN_S:g} s"
         )
     # One of them may be a move to the next SOC.
     if len(long) >= LONG_PULSES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 from chargetune.battery.identification.headings import Column, columns_of, missing, units_below
@@ -41,6 +42,8 @@ def read_samples(path: Path) -> Samples:
                     found.append(_samples(path.name, table, at, columns, others))
                     break
                 # Of two rows with as much in them the one with more cells is likelier to be the headings.
+                if not table.likely:
+                    continue
                 known = sum(quantity in columns for quantity in ("time", "current", "voltage")) + len(odd)
                 cells = [cell.strip() for cell in row if cell.strip()]
                 if (known, len(cells)) > (best[0], len(best[2])):
@@ -107,7 +110,7 @@ def _joined(name: str, parts: list[Samples]) -> Samples:
     sheets = ", ".join(part.name.rpartition("sheet ")[2] for part in parts)
     source = next(q for q in ("time", "step_time", "date") if q in first.columns)
     starts = [(part.cells[source][0], part.cells[source][-1]) for part in parts] if all(p == places[0] for p in places) else []
-    goes_on = bool(starts) and all(_rank(a[1]) <= _rank(b[0]) for a, b in zip(starts, starts[1:], strict=False))
+    goes_on = bool(starts) and all(_rank(a[1]) <= _rank(b[0]) for a, b in pairwise(starts))
     if not goes_on:
         raise ValueError(f"{name} has samples in the sheets {sheets}, allowed is one record; keep the sheet that is wanted")
     cells = {quantity: [cell for part in parts for cell in part.cells[quantity]] for quantity in first.columns}

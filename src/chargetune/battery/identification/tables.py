@@ -20,10 +20,11 @@ EXCEL_MARKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells as text, and where they stand ("" or "sheet Channel_1")."""
+    """Rows of cells as text, where they stand ("" or "sheet Channel_1"), and whether they may be one by chance."""
 
     rows: list[list[str]]
     where: str = ""
+    likely: bool = True
 
 
 def tables(path: Path) -> Iterator[list[Table]]:
@@ -51,7 +52,7 @@ def _texts(path: Path) -> Iterator[Table]:
         except csv.Error as error:
             raise ValueError(f"{path.name} is no table of text: {error}") from error
     for spaces in (r"\s{2,}", r"\s+"):
-        yield Table([re.split(spaces, line.strip()) for line in lines])
+        yield Table([re.split(spaces, line.strip()) for line in lines], likely=False)
 
 
 def _text(path: Path) -> str:
@@ -64,11 +65,23 @@ def _text(path: Path) -> str:
             text = content.decode(encoding)
         except UnicodeDecodeError:
             continue
-        if "\x00" not in text:
-            return text
+        if "\x00" in text:
+            continue
+        if encoding == "cp1252":
+            return _chinese(content) or text
+        return text
     raise ValueError(
         f"{path.name} is not text; allowed are text (CSV), Excel and Parquet. Export it from the cycler's program as one of these"
     )
+
+
+def _chinese(content: bytes) -> str | None:
+    """The text in GB 18030, where it then has the word for voltage or current; any bytes are some text in cp1252."""
+    try:
+        text = content.decode("gb18030")
+    except UnicodeDecodeError:
+        return None
+    return text if "电压" in text or "电流" in text else None
 
 
 def _parquet(path: Path) -> Table:
