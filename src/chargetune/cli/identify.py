@@ -52,13 +52,10 @@ def identify_command(
         check_format(figure)
     reading = Reading(cast("Sign | None", sign), *units)
     read = [data, *([] if ocv is None else [ocv]), *check]
-    # Before anything is read: what is one file in the end may not be one that is read.
-    claim(_outputs({None: out}, {None: figure}), inputs=read, overwrite=overwrite)
     record = read_record(data, reading)
     at = _temperatures(record, temperature_C)
     outs, figures = ({t: _with_temperature(path, t) for t in at} for path in (out, figure))
-    if at != [temperature_C]:
-        claim(_outputs(outs, figures), inputs=read, overwrite=overwrite)
+    claim(_outputs(outs, figures), inputs=read, overwrite=overwrite)
     slow = None if ocv is None else read_record(ocv, reading)
     known = [read_record(path, reading) for path in check]
     results = []
