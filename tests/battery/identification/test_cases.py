@@ -134,3 +134,58 @@ def test_the_ocv_is_the_rest_and_not_what_the_circuit_makes_of_it():
     found = identify(case("19"), capacity_Ah=4.0)
     np.testing.assert_allclose([fit.ocv_V for fit in found.fits][:2], [4.2001, 4.1017], atol=2e-4)
     assert said(found, "all 10 sets", "mV off the rest", "--rc 2")
+
+
+def damaged(tmp_path, change):
+    """The known record, with what ``change`` does to time, current, voltage and the sample that a pulse begins after."""
+    rows = np.genfromtxt(next(CASES.glob("16_*")), delimiter=",", skip_header=1)
+    begins = np.flatnonzero((rows[:-1, 1] == 0) & (rows[1:, 1] == -3) & (np.diff(rows[:, 0], prepend=0)[:-1] > 50))
+    change(rows, int(begins[3]))
+    np.savetxt(
+        tmp_path / "damaged.csv", rows, delimiter=",", header="Time_s,Current_A,Voltage_V", comments="", fmt=("%.3f", "%.5f", "%.5f")
+    )
+    return identify(read_record(tmp_path / "damaged.csv"))
+
+
+def put(column, offset, value, *, add=False):
+    def change(rows, k):
+        rows[k + offset, column] = value + add * rows[k + offset, column]
+
+    return change
+
+
+DAMAGE = {
+    "a spike at the end of a rest": (put(2, 0, 0.1, add=True), ("set 4 at SOC 0.69", "100 mV off")),
+    "a spike where a pulse begins": (put(2, 1, -0.2, add=True), ("set 4 at SOC 0.69", "-200 mV off")),
+    "a spike of two samples": (lambda rows, k: put(2, 10, 0.15, add=True)(rows, k) or put(2, 11, 0.15, add=True)(rows, k), ("150 mV off",)),
+    "a small spike": (put(2, 10, 0.02, add=True), ("set 4 at SOC 0.69", "20 mV off")),
+    "a spike in the pause": (put(2, 45, 0.5, add=True), ("set 4 at SOC 0.69", "500 mV off")),
+    "a spike of the current": (put(1, 12, -30.0), ("its current is -30 A between -3 A and -3 A",)),
+    "a current that was missed": (put(1, 12, 0.0), ("its current is 0 A between -3 A and -3 A",)),
+    "a time before the first": (put(0, -5, -5.0), ("its time is -5 s",)),
+    "a time after the last": (put(0, -5, 99999.0), ("its time is 99999 s",)),
+    "a time of 0 in a pulse": (put(0, 9, 0.0), ("its time is 0 s",)),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_single_samples_that_are_wrong_are_left_out_and_named(kind, tmp_path):
+    change, parts = DAMAGE[kind]
+    found = damaged(tmp_path, change)
+    is_the_known_cell(found, 9)
+    assert said(found, "left out", *parts)
+
+
+@pytest.mark.parametrize("amperes", [-0.02, 0.1, 0.15])
+def test_a_zero_of_the_current_of_some_per_cent_is_subtracted(amperes, tmp_path):
+    def change(rows, k):
+        rows[:, 1] += amperes
+
+    is_the_known_cell(damaged(tmp_path, change), 9)
+
+
+def test_a_zero_that_drifts_is_told(tmp_path):
+    def change(rows, k):
+        rows[:, 1] += 0.04 * rows[:, 0] / rows[-1, 0]
+
+    assert said(damaged(tmp_path, change), "the current reads", "in its 11 rests", "the counted charge is wrong")

@@ -31,6 +31,8 @@ AT_BOUND = 0.01
 LEVEL_SD, LEVEL_TOLD_MV = 5.0, 2.0
 # A sample is a spike if it is off by so many sd of the noise, and at least so many mV.
 SPIKE_SD, SPIKE_MIN_MV = 10.0, 5.0
+# One sample that makes more than this share of the sum of squares is no misfit of the circuit; of one set at most so many.
+LEFT_OUT_SHARE, LEFT_OUT_MAX = 0.1, 3
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,16 @@ def fit_set(record: Record, part: PulseSet, number: int, soc: NDArray[np.float64
     used = ~spikes(pulses.voltage_V, current, 1e-3 * max(SPIKE_SD * noise_mV, SPIKE_MIN_MV))
     used[0] = abs(1e3 * overpotential[0]) <= max(SPIKE_SD * noise_mV, SPIKE_MIN_MV)
     x, covariance, residuals = fit.solve(overpotential, used)
+    for _ in range(LEFT_OUT_MAX):
+        worst = int(np.argmax(np.abs(residuals) * used))
+        if 1e3 * abs(residuals[worst]) < max(SPIKE_SD * noise_mV, SPIKE_MIN_MV):
+            break
+        # Beside a jump of the current only the fit without it shows that a sample is off.
+        without = used & (np.arange(t.size) != worst)
+        again = fit.solve(overpotential, without)
+        if np.sum(again[2][without] ** 2) > LEFT_OUT_SHARE * np.sum(residuals[used] ** 2):
+            break
+        used, (x, covariance, residuals) = without, again
     fit.refuse(x, covariance)
     spread = np.sqrt(np.diag(covariance))
     values = dict(zip(fit.names, np.exp(x[:-1]).tolist(), strict=True))

@@ -21,8 +21,11 @@ GAP_MAX_S = 300.0
 REST_INTERVALS = 1.5
 # A rest of the current's sensor: at least so many stretches of at least so many s below this share of the largest current.
 QUIET_MIN, QUIET_S, QUIET_SHARE = 3, 300.0, 0.06
+# A spike of the current, as a share of the usual one; what is the same beside it, and a voltage that does not answer, V.
+SPIKE_SHARE, UNSEEN, UNSEEN_V, SPIKES_SHARE = 0.5, 0.02, 1e-3, 1e-3
 # A zero of less than this share of the largest current moves the charge less than it is known; of all rests alike, within this share.
-OFFSET_TOLD, OFFSET_SAME, SAME_LEVEL = 5e-4, 0.2, 2e-3
+# or by as many standard errors as the range of some tens of values has; a noise of more than the last share is no rest.
+OFFSET_TOLD, OFFSET_SAME, ERRORS, SAME_LEVEL = 5e-4, 0.2, 6.0, 0.02
 
 
 def checked(record: Record, *, sign: Sign | None = None, known_sign: bool = False) -> Record:
@@ -32,7 +35,7 @@ def checked(record: Record, *, sign: Sign | None = None, known_sign: bool = Fals
     what is no cell's voltage, no current, a gap with current, and a current without a sign.
     """
     _refuse_nonsense(record)
-    record = _without_offset(record)
+    record = _without_offset(_without_current_spikes(record))
     _refuse_gaps(record)
     return _with_ends_of_rests(with_sign(record, sign, known=known_sign))
 
@@ -53,6 +56,29 @@ def _refuse_nonsense(record: Record) -> None:
         )
 
 
+def _without_current_spikes(record: Record) -> Record:
+    """The record without single samples whose current the voltage did not see: they were logged wrong, or between two steps."""
+    current, voltage = record.current_A, record.voltage_V
+    if len(record) < 3:
+        return record
+    beside, across = np.abs(current[1:-1] - current[:-2]), np.abs(current[2:] - current[:-2])
+    answer, course = np.abs(voltage[1:-1] - (voltage[2:] + voltage[:-2]) / 2), np.abs(voltage[2:] - voltage[:-2])
+    usual = float(np.median(np.abs(current[np.abs(current) > record.rest_A])))
+    wrong = 1 + np.flatnonzero((beside > SPIKE_SHARE * usual) & (across < UNSEEN * beside) & (answer < UNSEEN_V + course))
+    # Some samples of thousands; of more it is how the current was driven.
+    if not wrong.size or wrong.size > max(1, SPIKES_SHARE * len(record)):
+        return record
+    notes = [
+        f"sample {k + 1} was left out: its current is {current[k]:g} A between {current[k - 1]:g} A and {current[k + 1]:g} A, and the "
+        "voltage does not show it"
+        for k in wrong.tolist()
+    ]
+    keep = np.ones(len(record), dtype=bool)
+    keep[wrong] = False
+    warm = None if record.temperature_K is None else record.temperature_K[keep]
+    return Record(record.source, record.time_s[keep], current[keep], voltage[keep], warm, (*record.remarks, *notes))
+
+
 def _without_offset(record: Record) -> Record:
     """The record without what the current reads in all of its rests alike, which is the sensor's zero and not the cell's charge."""
     largest = float(np.max(np.abs(record.current_A)))
@@ -61,15 +87,16 @@ def _without_offset(record: Record) -> Record:
     levels = []
     for first, last in edges.reshape(-1, 2):
         if record.time_s[last - 1] - record.time_s[first] >= QUIET_S:
-            levels.append((float(np.median(record.current_A[first:last])), float(np.ptp(record.current_A[first:last]))))
+            part = record.current_A[first:last]
+            levels.append((float(np.median(part)), float(np.ptp(part)), float(np.std(part)) / part.size**0.5))
     if len(levels) < QUIET_MIN:
         return record
-    values = np.array([level for level, _ in levels])
+    values, spreads, errors = np.array(levels).T
     zero = float(np.median(values))
-    told, same = abs(zero) > OFFSET_TOLD * largest, np.ptp(values) <= OFFSET_SAME * abs(zero)
+    told, same = abs(zero) > OFFSET_TOLD * largest, np.ptp(values) <= max(OFFSET_SAME * abs(zero), ERRORS * float(np.max(errors)))
     if not told:
         return record
-    if not same or max(spread for _, spread in levels) > max(abs(zero), SAME_LEVEL * largest):
+    if not same or np.max(spreads) > max(abs(zero), SAME_LEVEL * largest):
         note = (
             f"the current reads {1e3 * values.min():.3g} to {1e3 * values.max():.3g} mA in its {len(levels)} rests: if that is the "
             "sensor's zero, the counted charge is wrong"
