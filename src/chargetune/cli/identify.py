@@ -54,7 +54,7 @@ def identify_command(
     read = [data, *([] if ocv is None else [ocv]), *check]
     record = read_record(data, reading)
     at = _temperatures(record, temperature_C)
-    outs, figures = ({t: _with_temperature(path, t) for t in at} for path in (out, figure))
+    outs, figures = ({t: _with_temperature(path, t) if len(at) > 1 else path for t in at} for path in (out, figure))
     claim(_outputs(outs, figures), inputs=read, overwrite=overwrite)
     slow = None if ocv is None else read_record(ocv, reading)
     known = [read_record(path, reading) for path in check]

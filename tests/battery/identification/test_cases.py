@@ -141,10 +141,9 @@ def damaged(tmp_path, change):
     rows = np.genfromtxt(next(CASES.glob("16_*")), delimiter=",", skip_header=1)
     begins = np.flatnonzero((rows[:-1, 1] == 0) & (rows[1:, 1] == -3) & (np.diff(rows[:, 0], prepend=0)[:-1] > 50))
     change(rows, int(begins[3]))
-    np.savetxt(
-        tmp_path / "damaged.csv", rows, delimiter=",", header="Time_s,Current_A,Voltage_V", comments="", fmt=("%.3f", "%.5f", "%.5f")
-    )
-    return identify(read_record(tmp_path / "damaged.csv"))
+    path = tmp_path / "damaged.csv"
+    np.savetxt(path, rows, delimiter=",", header="Time_s,Current_A,Voltage_V", comments="", fmt=("%.3f", "%.5f", "%.5f"))
+    return identify(read_record(path))
 
 
 def put(column, offset, value, *, add=False):

@@ -154,3 +154,17 @@ def test_two_sheets_of_one_record_are_joined_and_of_two_refused(tmp_path):
         assert len(read(monkey, 0, 5).numbers) == 10
         with pytest.raises(ValueError, match=r"book\.xlsx has samples in the sheets S0, S0, allowed is one record"):
             read(monkey, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("cut.parquet", b"PAR1" + b"x" * 100, "no Parquet file that can be read"),
+        ("cut.xlsx", b"PK\x03\x04" + b"x" * 100, "no workbook that can be read"),
+        ("noise.csv", bytes(range(256)) * 4, "is not text; allowed are text"),
+    ],
+)
+def test_a_damaged_container_is_refused(name, content, said, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=f"^{name} .*{said}"):
+        read_record(tmp_path / name)

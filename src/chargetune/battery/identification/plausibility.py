@@ -21,8 +21,9 @@ GAP_MAX_S = 300.0
 REST_INTERVALS = 1.5
 # A rest of the current's sensor: at least so many stretches of at least so many s below this share of the largest current.
 QUIET_MIN, QUIET_S, QUIET_SHARE = 3, 300.0, 0.06
-# A spike of the current, as a share of the usual one; what is the same beside it, and a voltage that does not answer, V.
-SPIKE_SHARE, UNSEEN, UNSEEN_V, SPIKES_SHARE = 0.5, 0.02, 1e-3, 1e-3
+# A spike of the current, as a share of the usual one; what is the same on both sides, as a share of the spike; a voltage that does not
+# answer, as a share of how it answers usually; and at most so many, as a share of the samples.
+SPIKE_SHARE, SAME_SHARE, UNSEEN_SHARE, SPIKES_SHARE = 0.5, 0.02, 0.2, 0.01
 # A zero of less than this share of the largest current moves the charge less than it is known; of all rests alike, within this share.
 # or by as many standard errors as the range of some tens of values has; a noise of more than the last share is no rest.
 OFFSET_TOLD, OFFSET_SAME, ERRORS, SAME_LEVEL = 5e-4, 0.2, 6.0, 0.02
@@ -62,11 +63,14 @@ def _without_current_spikes(record: Record) -> Record:
     if len(record) < 3:
         return record
     beside, across = np.abs(current[1:-1] - current[:-2]), np.abs(current[2:] - current[:-2])
-    answer, course = np.abs(voltage[1:-1] - (voltage[2:] + voltage[:-2]) / 2), np.abs(voltage[2:] - voltage[:-2])
+    answer = np.abs(voltage[1:-1] - (voltage[2:] + voltage[:-2]) / 2)
     usual = float(np.median(np.abs(current[np.abs(current) > record.rest_A])))
-    wrong = 1 + np.flatnonzero((beside > SPIKE_SHARE * usual) & (across < UNSEEN * beside) & (answer < UNSEEN_V + course))
-    # Some samples of thousands; of more it is how the current was driven.
-    if not wrong.size or wrong.size > max(1, SPIKES_SHARE * len(record)):
+    steps = np.abs(np.diff(current))
+    jumps = steps > SPIKE_SHARE * usual
+    ohms = float(np.median(np.abs(np.diff(voltage))[jumps] / steps[jumps])) if jumps.any() else 0.0
+    wrong = 1 + np.flatnonzero((beside > SPIKE_SHARE * usual) & (across < SAME_SHARE * beside) & (answer < UNSEEN_SHARE * ohms * beside))
+    # Single samples of hundreds; of more it is how the current was driven.
+    if not wrong.size or wrong.size > SPIKES_SHARE * len(record):
         return record
     notes = [
         f"sample {k + 1} was left out: its current is {current[k]:g} A between {current[k - 1]:g} A and {current[k + 1]:g} A, and the "

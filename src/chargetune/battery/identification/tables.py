@@ -30,7 +30,7 @@ class Table:
 def tables(path: Path) -> Iterator[list[Table]]:
     """Every way to read the file as tables, the likeliest first: each sheet of a workbook, each separator of a text.
 
-    Raises FileNotFoundError, ValueError for what is neither, and ImportError with what to install.
+    Raises FileNotFoundError, and ValueError for what is none of them or with what has to be installed to read it.
     """
     with path.open("rb") as file:
         mark = file.read(4)
@@ -86,10 +86,13 @@ def _chinese(content: bytes) -> str | None:
 
 def _parquet(path: Path) -> Table:
     try:
-        from pyarrow import parquet
+        from pyarrow import ArrowException, parquet
     except ImportError as error:
-        raise ImportError(f"to read {path.name} chargetune needs pyarrow: pip install chargetune[export]") from error
-    whole = parquet.read_table(path)
+        raise ValueError(f"to read {path.name} chargetune needs pyarrow: pip install chargetune[export]") from error
+    try:
+        whole = parquet.read_table(path)
+    except (ArrowException, OSError) as error:
+        raise ValueError(f"{path.name} is no Parquet file that can be read: {error}") from error
     columns = [[_cell(value) for value in column.to_pylist()] for column in whole.columns]
     return Table([list(whole.column_names), *(list(row) for row in zip(*columns, strict=True))])
 
@@ -98,7 +101,7 @@ def _sheets(path: Path) -> list[Table]:
     try:
         import python_calamine as calamine
     except ImportError as error:
-        raise ImportError(f"to read {path.name} chargetune needs python-calamine: pip install chargetune[excel]") from error
+        raise ValueError(f"to read {path.name} chargetune needs python-calamine: pip install chargetune[excel]") from error
     try:
         book = calamine.CalamineWorkbook.from_path(str(path))
         sheets = [(name, book.get_sheet_by_name(name).to_python(skip_empty_area=False)) for name in book.sheet_names]
