@@ -27,6 +27,8 @@ ORDERS = {"ymd": (0, 1, 2), "mdy": (2, 0, 1), "dmy": (2, 1, 0)}
 def decimal_mark(columns: dict[str, Sequence[str]]) -> str:
     """The one decimal mark of all numbers of the file. Raises ValueError that names column, row (from 0) and cell."""
     last, alone = "", dict[str, tuple[str, int, str]]()
+    if not any("," in "".join(cells) for cells in columns.values()):
+        return "."
     for heading, cells in columns.items():
         for row, cell in enumerate(cells):
             if ":" in cell:
@@ -96,14 +98,17 @@ class DateTimes:
     """Moments of a column of dates, in s from the first, by every order of day and month that all of them can have."""
 
     def __init__(self, cells: Sequence[str]) -> None:
-        matches = [DATE.fullmatch(cell.strip()) for cell in cells]
-        if not cells or not all(matches):
-            k = next((i for i, match in enumerate(matches) if not match), 0)
-            raise ValueError(f"{k}|{cells[k] if cells else ''}")
+        matches = []
+        for cell in cells:
+            if (match := DATE.fullmatch(cell.strip())) is None:
+                raise ValueError(f"{cell!r}, allowed is a date")
+            matches.append(match)
+        if not matches:
+            raise ValueError("no dates")
         self.by_order: dict[str, NDArray[np.float64]] = {}
         for order, places in ORDERS.items():
             try:
-                moments = np.array([_moment(match.groups(), places) for match in matches if match])
+                moments = np.array([_moment(match.groups(), places) for match in matches])
             except ValueError:
                 continue
             self.by_order[order] = moments - moments[0]

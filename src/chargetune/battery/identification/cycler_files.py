@@ -36,7 +36,7 @@ MILLIVOLTS_FROM, AMPERES_TO = 100.0, 100.0
 # How a remark calls the order of a date.
 ORDERS = {"ymd": "year, month, day", "mdy": "month, day, year", "dmy": "day, month, year"}
 # Dates and clock of one file differ by less than this share.
-DATES_SHARE = 0.02
+DATES_SHARE, DATES_READ = 0.02, 200
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,19 @@ def _decided(columns: dict[str, Column], options: Reading, remarks: list[str]) -
     return decided
 
 
+def _plain(cells: list[str]) -> list[float] | None:
+    """The numbers, where every cell is a plain finite one."""
+    try:
+        values = list(map(float, cells))
+    except ValueError:
+        return None
+    return values if np.all(np.isfinite(values)) else None
+
+
 def _numbers(samples: Samples, quantity: str, mark: str) -> list[float]:
     values, column = [], samples.columns[quantity]
+    if mark == "." and (quick := _plain(samples.cells[quantity])) is not None:
+        return quick
     for row, cell in zip(samples.numbers, samples.cells[quantity], strict=True):
         try:
             values.append(number(cell, mark))
@@ -138,8 +149,11 @@ def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remar
             raise ValueError(f"{samples.name}: {column.heading} = {cells[0]!r} to {cells[-1]!r}, allowed are {error}") from None
         remarks.append(f"time is from the dates in {column.heading} ({ORDERS[order]})")
         return seconds, False
-    values, clocks = [], 0
-    for row, cell in zip(samples.numbers, cells, strict=True):
+    if mark == "." and (quick := _plain(cells)) is not None:
+        values, clocks, left = [column.factor * value for value in quick], 0, []
+    else:
+        values, clocks, left = [], 0, list(zip(samples.numbers, cells, strict=True))
+    for row, cell in left:
         try:
             clock = clock_seconds(cell, column.unit) if ":" in cell else None
             clocks += clock is not None
@@ -204,7 +218,10 @@ def _compared(
     """Compare the clock with the dates of the file, where it has both: another unit is refused, another span is told."""
     if source == "date" or "date" not in columns or not time[-1]:
         return
-    moments = dates([cell for cell, kept in zip(samples.cells["date"], keep, strict=True) if kept])
+    # The first, the last and some between tell the span and the order of day and month.
+    kept = np.flatnonzero(keep)
+    some = np.unique(kept[np.linspace(0, kept.size - 1, min(DATES_READ, kept.size)).astype(int)])
+    moments = dates([samples.cells["date"][k] for k in some.tolist()])
     found = [] if moments is None else [seconds for seconds in moments.by_order.values() if np.all(np.diff(seconds) >= 0)]
     # A date alone, without the time of day, tells nothing.
     spans = [float(seconds[-1]) for seconds in found if np.any(seconds % DAY_S)]

@@ -69,37 +69,41 @@ def _samples(name: str, table: Table, at: int, columns: dict[str, Column], other
     while heads and not heads[-1]:
         heads.pop()
     lead = next(i for i, cell in enumerate(heads) if cell)
-    below = [(number, row) for number, row in enumerate(table.rows[at + 1 :], start=at + 2) if any(cell.strip() for cell in row)]
+    below = [(number, row) for number, row in enumerate(table.rows[at + 1 :], start=at + 2) if "".join(row).strip()]
     remarks: list[str] = []
     if below and (united := units_below(columns, below[0][1])) is not None:
         columns, below = united, below[1:]
-    below = [(number, row) for number, row in below if [cell.strip() for cell in row[: len(heads)]] != heads]
+    # A file that was joined from several has its headings again.
+    first = heads[lead]
+    below = [pair for pair in below if first not in pair[1] or [cell.strip() for cell in pair[1][: len(heads)]] != heads]
     # Below headings that begin further right, rows that begin with the first column are the sums of a step or a cycle.
-    nested = [not any(cell.strip() for cell in row[:lead]) for _, row in below]
+    nested = [not "".join(row[:lead]).strip() for _, row in below] if lead else []
     if any(nested):
         below = [pair for pair, sample in zip(below, nested, strict=True) if sample]
-    cells: dict[str, list[str]] = {quantity: [] for quantity in columns}
+    places, width = [column.index for column in columns.values()], len(heads)
     numbers: list[int] = []
+    found: list[list[str]] = []
     before: list[str] = []
     twice = 0
     for count, (number, row) in enumerate(below, start=1):
-        if any(cell.strip() for cell in row[len(heads) :]):
+        if len(row) > width and "".join(row[width:]).strip():
             raise ValueError(
-                f"{name}, row {number} has {len(row)} cells, allowed are {len(heads)} as in the header "
+                f"{name}, row {number} has {len(row)} cells, allowed are {width} as in the header "
                 "(decimal commas need semicolons or tabs between columns)"
             )
-        if row == before:
-            twice += 1
-            continue
-        before = row
-        if count == len(below) and len(row) < len(heads) and len(row) <= max(c.index for c in columns.values()):
+        if count == len(below) and len(row) <= max(places) < width:
             remarks.append(f"the last row ({number}) is cut off and was left out")
             continue
+        picked = [row[k].strip() if k < len(row) else "" for k in places]
+        if picked == before:
+            twice += 1
+            continue
+        before = picked
         numbers.append(number)
-        for quantity, column in columns.items():
-            cells[quantity].append(row[column.index].strip() if column.index < len(row) else "")
+        found.append(picked)
     if twice:
-        remarks.append(f"{twice} rows are equal to the row before in every cell; they were left out")
+        remarks.append(f"{twice} row{'s are' if twice > 1 else ' is'} equal to the row before in time, current and voltage: left out")
+    cells = {quantity: [picked[k] for picked in found] for k, quantity in enumerate(columns)}
     return Samples(name, columns, others, cells, numbers, remarks)
 
 
