@@ -57,7 +57,7 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
         return
     out = console()
     out.print(
-        f"[bold]{escape(problem.cell.name)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
+        f"[bold]{escape(problem.cell.title)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
         f"ended: {episode.ending.value}"
     )
     if problem.cell.remark:

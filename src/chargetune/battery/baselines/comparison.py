@@ -11,7 +11,7 @@ import numpy as np
 
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
 from chargetune.battery.charging.evaluate import plant_of, run_charge
-from chargetune.battery.charging.problem import ChargingProblem, with_feedback
+from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant, with_feedback
 from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
@@ -66,7 +66,7 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
     if problem.estimator.kind not in ("offset_free", "adaptive"):
         names.append("nominal offset-free MPC")
     names.append("best constant backoff")
-    if problem.plant is None:
+    if problem.plant_cell is not None:
         names.append("MPC with the true model")
     return [*names, *(["tuned"] if theta is not None else [])]
 
@@ -94,7 +94,6 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
         share = CCCV_SHARES[row_names(problem, theta).index(name)]
         return _stepped(problem, name, constant_current(share * largest), voltage)
     plain = replace(problem, theta=Tunables())
-    true = replace(plain, controller=replace(plain.controller, mismatch_seed=None))
     table: dict[str, Callable[[], Row]] = {
         "multi-step CC": lambda: _stepped(problem, name, multi_step([s * largest for s in STEP_SHARES]), voltage),
         "four-step CC (Attia)": lambda: _stepped(
@@ -104,7 +103,7 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
         "nominal offset-free MPC": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
         "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
-        "MPC with the true model": lambda: _judged(plain, name, run_charge(true, None, seed)),
+        "MPC with the true model": lambda: _judged(plain, name, run_charge(knowing_the_plant(plain), None, seed)),
         "tuned": lambda: _judged(problem, name, run_charge(problem, theta, seed)),
     }
     return table[name]()

@@ -15,7 +15,7 @@ from chargetune.battery.baselines.comparison import constant_backoff, smallest_t
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.limits import Limit
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant
 from chargetune.battery.charging.tunables import Tunables
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.compiled import compiled_episode
@@ -66,7 +66,7 @@ class RangeRow:
 def range_row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
     """What can be compared over the range, in the order of the table."""
     names = ["CC-CV", "nominal MPC", "best constant backoff", *(["tuned"] if theta is not None else [])]
-    return [*names, *(["MPC that knows each plant"] if problem.plant is None else []), ORACLE]
+    return [*names, *(["MPC that knows each plant"] if problem.plant_cell else []), ORACLE]
 
 
 def compare_range(
@@ -115,7 +115,9 @@ class _Drawn:
             "nominal MPC": lambda: self._controlled(name, problem, problem.space.default),
             "best constant backoff": lambda: self._backoff(name, plain),
             "tuned": lambda: self._controlled(name, problem, np.array(theta)),
-            "MPC that knows each plant": lambda: RangeRow(name, tuple(self._score(_knowing(plain, one)) for one in self.plants)),
+            "MPC that knows each plant": lambda: RangeRow(
+                name, tuple(self._score(_knowing(knowing_the_plant(plain), one)) for one in self.plants)
+            ),
             ORACLE: lambda: RangeRow(name, tuple(self._stepped(one, 1.0, list(problem.limits_by_name.values())) for one in self.plants)),
         }
         return table[name]()

@@ -91,6 +91,19 @@ class Electrochemical:
         return ElectrochemicalPlant(self, soc_start, sampling_time_s, sensors)
 
     @property
+    def file(self) -> str:
+        """Path of the BPX file; empty for a named set."""
+        return self.parameters if Path(self.parameters).suffix.lower() == ".json" else ""
+
+    @property
+    def line(self) -> str:
+        """What it is, in words."""
+        shown = Path(self.file).name or self.parameters
+        changed = [f"{name} {value:g}" for name in ("capacity_scale", "resistance_scale") if (value := getattr(self, name)) != 1.0]
+        cooled = f"{self.ambient_K:g} K ambient, cooled with {self.cooling_W_m2K:g} W/m2K"
+        return ", ".join([f"{self.model} of PyBaMM with the parameters {shown}", cooled, *changed])
+
+    @property
     def capacity_Ah(self) -> float:
         """Charge between SOC 0 and 1, which the model's open-circuit voltages define, times ``capacity_scale``."""
         return _built(self, 0.5).capacity_Ah
@@ -305,15 +318,11 @@ def _without(settings: Electrochemical) -> Electrochemical:
     return Electrochemical(**{**settings.__dict__, "resistance_scale": 1.0})
 
 
-def _is_file(parameters: str) -> bool:
-    return Path(parameters).suffix.lower() == ".json"
-
-
 def _parameters(settings: Electrochemical) -> Any:
     """A fresh set of parameter values. Raises SetUpError for an unknown name, and for a file that is missing or is none."""
     import pybamm
 
-    if _is_file(settings.parameters):
+    if settings.file:
         if not Path(settings.parameters).is_file():
             raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
         try:
