@@ -223,12 +223,15 @@ def identify(
     out: Annotated[Path, typer.Option("--output", "-o", help="Cell file to write.")] = Path("cell.toml"),
     rc: Annotated[int, typer.Option(min=1, max=2, help="R-C pairs of the circuit.")] = 1,
     capacity: Annotated[
-        float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
+        float | None,
+        typer.Option("--capacity-Ah", help="Capacity of one cell; by default the charge between the record's fullest and emptiest point."),
     ] = None,
     ocv: Annotated[
         Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from; surer near full and empty.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
+    series: Annotated[int, typer.Option(min=1, help="Cells in series, where the files are of a pack; the cell file is of one cell.")] = 1,
+    parallel: Annotated[int, typer.Option(min=1, help="Cells in parallel, where the files are of a pack.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
     check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,
     overwrite: Overwrite = False,
@@ -246,6 +249,8 @@ def identify(
         name=name,
         figure=figure,
         check=check or [],
+        series=series,
+        parallel=parallel,
         overwrite=overwrite,
         as_json=as_json,
     )

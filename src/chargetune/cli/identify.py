@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.identification.cycler_files import read_record
+from chargetune.battery.identification.cycler_files import Reading, read_record
 from chargetune.battery.identification.pulse_fit import Identification, cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.record import Record, segments
 from chargetune.cli.output import console
@@ -34,6 +34,8 @@ def identify_command(
     name: str | None,
     figure: Path | None,
     check: list[Path],
+    series: int,
+    parallel: int,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -43,12 +45,13 @@ def identify_command(
     drawn = [] if figure is None else [Output("--figure", figure, figure_kind(figure))]
     read = [data, *([] if ocv is None else [ocv]), *check]
     claim([Output("--output", out, Kind.CELL), *drawn], inputs=read, overwrite=overwrite)
-    slow = None if ocv is None else read_record(ocv)
-    known = [read_record(path) for path in check]
-    found = identify(read_record(data), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
+    reading = Reading(series=series, parallel=parallel)
+    slow = None if ocv is None else read_record(ocv, reading)
+    known = [read_record(path, reading) for path in check]
+    found = identify(read_record(data, reading), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
     checks = [(record.source, *_check(found, record)) for record in known]
     today = datetime.now().astimezone().date().isoformat()
-    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}.", series=series, parallel=parallel))
     raise_lost_interrupt()
     out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, cell_toml(found.cell, found.remarks))
@@ -77,6 +80,8 @@ def identify_command(
         line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
         screen.print(line, markup=False, soft_wrap=True)
     screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
+    if found.cell.pack_line:
+        screen.print(found.cell.pack_line, markup=False, soft_wrap=True)
     screen.print(f"next: put the limits of its data sheet into it, then chargetune init --cell {out}", markup=False, soft_wrap=True)
 
 

@@ -80,10 +80,11 @@ class ChargingProblem:
 
     def _check_bounds(self) -> None:
         cell = self.cell
-        least = check_number("current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
-        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
-        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
-        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, "V")
+        each = " per cell of the pack" if cell.pack_line else ""
+        least = check_number("current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, f"A{each}")
+        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, f"A{each}", open_low=True)
+        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}", open_low=True)
+        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}")
         if least >= most:
             raise ValueError(f"current_min_A = {least:g} must be less than current_max_A = {most:g}")
         if lowest >= highest:
@@ -211,6 +212,11 @@ class ChargingProblem:
     def plant_line(self) -> str:
         """What the plant is, in words."""
         return "its own circuit, simulated" if self.plant is None else str(getattr(self.plant, "line", self.plant))
+
+    @property
+    def setting_lines(self) -> list[str]:
+        """What is not the usual case of one cell on its own circuit, in words: the plant, the pack."""
+        return [*([f"plant: {self.plant_line}"] if self.plant else []), *([self.cell.pack_line] if self.cell.pack_line else [])]
 
     @property
     def controller_cell(self) -> Cell:
