@@ -195,8 +195,6 @@ def test_the_model_is_built_once():
     assert _built.cache_info().misses == built
 
 
-# PyBaMM says which of its fields a BPX file does not have.
-@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_bpx_file(tmp_path):
     path = tmp_path / "cell.json"
     path.write_text(json.dumps(CELL))
@@ -261,7 +259,6 @@ def test_every_other_set_that_the_message_names_runs(name):
     charges_at_1C(Electrochemical(model="SPM", parameters=name))
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("model", ["SPM", "SPMe", "DFN"])
 def test_a_bpx_file_runs_every_model_at_1C(model, tmp_path):
     path = tmp_path / "cell.json"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -334,7 +335,10 @@ def _parameters(settings: Electrochemical) -> Any:
         if not Path(settings.parameters).is_file():
             raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
         try:
-            return pybamm.ParameterValues.create_from_bpx(settings.parameters)
+            with warnings.catch_warnings():
+                # That the file's cut-off voltages stand for the OCV at SOC 0 and 1 where it has none of these, as docs/cells.md says.
+                warnings.filterwarnings("ignore", message=".*not found in BPX file", category=UserWarning)
+                return pybamm.ParameterValues.create_from_bpx(settings.parameters)
         except Exception as error:
             # Its parser raises what pydantic, json and pybamm raise.
             raise SetUpError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
