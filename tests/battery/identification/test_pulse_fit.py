@@ -14,8 +14,8 @@ from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.identification.cycler_files import read_record
-from chargetune.battery.identification.pulse_fit import cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.plausibility import checked
+from chargetune.battery.identification.pulse_fit import cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.pulses import find_pulse_sets, groups
 from chargetune.battery.identification.record import Record, segments
 from chargetune.battery.identification.thermal import activation_energy, with_thermal
