@@ -107,7 +107,7 @@ def test_the_certificate_is_of_the_range_that_theta_was_tuned_for(folder):
     ("tables", "words"),
     [
         ({}, "tuner = 'range' is given without a table [range]"),
-        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with [plant]"),
+        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with an electrochemical [plant]"),
     ],
 )
 def test_a_range_that_cannot_be_tuned_is_refused(tables, words, tmp_path, refused):
