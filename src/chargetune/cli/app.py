@@ -261,6 +261,7 @@ def compare(
     config: ConfigFile,
     store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
+    row: Annotated[list[str] | None, typer.Option(help="Only this row of the table; repeat it for several.", show_default=False)] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws, and of the noise that the controllers see.")] = 0,
     draws: Annotated[
         int | None,
@@ -278,7 +279,16 @@ def compare(
     from chargetune.cli.compare import compare_command
 
     compare_command(
-        config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, overwrite=overwrite, as_json=as_json
+        config,
+        store=store,
+        study=study,
+        rows=row or [],
+        seed=seed,
+        draws=draws,
+        workers=workers,
+        figure=figure,
+        overwrite=overwrite,
+        as_json=as_json,
     )
 
 
