@@ -35,7 +35,7 @@ def made(name, capacity_Ah, r0_ohm, r1_ohm, tau_s, ocv_V, voltages, rate, **more
 
 KINDS = {
     "LFP 2.5 Ah": made("LFP 2.5 Ah", 2.5, 0.012, 0.01, 25.0, LFP_V, (2.0, 3.65), 4.0),
-    "LTO 2.9 Ah": made("LTO 2.9 Ah", 2.9, 0.0012, 0.0008, 15.0, LTO_V, (1.5, 2.8), 10.0),
+    "LTO 1.5 Ah": made("LTO 1.5 Ah", 1.5, 0.012, 0.008, 15.0, LTO_V, (1.5, 2.8), 10.0),
     "NMC 5 Ah": made("NMC 5 Ah", 5.0, 0.015, 0.012, 30.0, NMC_V, (2.5, 4.2), 2.0),
     "coin 45 mAh": made("coin 45 mAh", 0.045, 1.2, 0.8, 20.0, LCO_V, (2.75, 4.2), 1.0),
     "prismatic 280 Ah": made(

@@ -116,6 +116,9 @@ def check_limits(
             # A state at the start of an interval is the same as at the end of the one before.
             ends["start"] = ends["end"]
         seen = np.max([ends[name] for name in ("start", "end") if limit.at in (name, "both")], axis=0)
+        if np.isnan(seen).any():
+            out.append(_not_known(limit, run, seen))
+            continue
         inside = np.maximum(ends["start"], ends["end"]) + _hump(controller, j, finer, run, theta, given)
         if np.max(seen) > noticeable(limit):
             out += _broken_where_seen(controller, j, run, seen, theta, given)
@@ -226,6 +229,19 @@ def _signals(controller: Controller, given: Given | None, count: int) -> tuple[N
     seen = windows([values[name] for name in controller.given_names], count, controller.horizon)
     _, now, then, *_ = np.moveaxis(seen.reshape(count, controller.horizon + 2, -1), 1, 0)
     return now, then
+
+
+def _not_known(limit: LimitRows, run: Episode, seen: NDArray[np.float64]) -> Finding:
+    lost = np.isnan(seen)
+    return Finding(
+        "limit-not-kept",
+        "warning",
+        f"{limit.of} or its bound is no number in {np.sum(lost)} of {len(run)} intervals of a perfect model, first after "
+        f"{run.time_s[np.argmax(lost)] / 60:.3g} min: a limit that is not known is not kept",
+        f"an expression of {limit.of} and of its bound that is defined wherever the model goes",
+        {"intervals": float(np.sum(lost)), "first_min": float(run.time_s[np.argmax(lost)] / 60)},
+        Evidence("time (min)", f"{limit.of} beyond its limit", {"closed loop": (run.time_s / 60, seen)}, {"limit": 0.0}),
+    )
 
 
 def _between(limit: LimitRows, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float) -> Finding:

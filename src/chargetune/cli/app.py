@@ -243,12 +243,15 @@ def identify(
     ] = Path("cell.toml"),
     rc: Annotated[int, typer.Option(min=1, max=2, help="R-C pairs of the circuit.")] = 1,
     capacity: Annotated[
-        float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
+        float | None,
+        typer.Option("--capacity-Ah", help="Capacity of one cell; by default the charge between the record's fullest and emptiest point."),
     ] = None,
     ocv: Annotated[
         Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from; surer near full and empty.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
+    series: Annotated[int, typer.Option(min=1, help="Cells in series, where the files are of a pack; the cell file is of one cell.")] = 1,
+    parallel: Annotated[int, typer.Option(min=1, help="Cells in parallel, where the files are of a pack.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
     check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,
     temperature: Annotated[float | None, typer.Option("--temperature", help="Only the pulses at this temperature, degree Celsius.")] = None,
@@ -282,6 +285,8 @@ def identify(
         branch=branch.value,
         sign=None if sign is None else sign.value,
         units=(time_unit, current_unit),
+        series=series,
+        parallel=parallel,
         overwrite=overwrite,
         as_json=as_json,
     )
@@ -292,6 +297,7 @@ def compare(
     config: ConfigFile,
     store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
+    row: Annotated[list[str] | None, typer.Option(help="Only this row of the table; repeat it for several.", show_default=False)] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws, and of the noise that the controllers see.")] = 0,
     draws: Annotated[
         int | None,
@@ -309,7 +315,16 @@ def compare(
     from chargetune.cli.compare import compare_command
 
     compare_command(
-        config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, overwrite=overwrite, as_json=as_json
+        config,
+        store=store,
+        study=study,
+        rows=row or [],
+        seed=seed,
+        draws=draws,
+        workers=workers,
+        figure=figure,
+        overwrite=overwrite,
+        as_json=as_json,
     )
 
 

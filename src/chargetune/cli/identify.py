@@ -44,13 +44,15 @@ def identify_command(
     branch: str,
     sign: str | None,
     units: tuple[str | None, str | None],
+    series: int,
+    parallel: int,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Fit a cell to measured pulses, at each temperature where there are several, write it, and say how well it fits."""
     if figure is not None:
         check_format(figure)
-    reading = Reading(cast("Sign | None", sign), *units)
+    reading = Reading(cast("Sign | None", sign), *units, series=series, parallel=parallel)
     read = [data, *([] if ocv is None else [ocv]), *check]
     record = read_record(data, reading)
     at = _temperatures(record, temperature_C)
@@ -70,7 +72,7 @@ def identify_command(
             branch=cast("Branch", branch),
         )
         today = datetime.now().astimezone().date().isoformat()
-        found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+        found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}.", series=series, parallel=parallel))
         results.append((t, found, [(one.source, *_check(found, one)) for one in known]))
     raise_lost_interrupt()
     for t, found, _ in results:
@@ -86,6 +88,8 @@ def identify_command(
         _show(screen, found, checks)
         drawn = f"\nfigure {figures[t]}" if figures[t] else ""
         screen.print(f"cell in {outs[t]}{drawn}", markup=False, soft_wrap=True)
+        if found.cell.pack_line:
+            screen.print(found.cell.pack_line, markup=False, soft_wrap=True)
     if len(at) > 1:
         joules = activation_energy({cast("float", t) + ZERO_CELSIUS_K: found.cell for t, found, _ in results})
         screen.print(

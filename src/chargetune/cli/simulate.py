@@ -57,9 +57,11 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
         return
     out = console()
     out.print(
-        f"[bold]{escape(problem.cell.name)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
+        f"[bold]{escape(problem.cell.title)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
         f"ended: {episode.ending.value}"
     )
+    for line in problem.setting_lines:
+        out.print(f"[dim]{escape(line)}[/]")
     if problem.cell.remark:
         out.print(f"[dim]{escape(problem.cell.remark)}[/]")
     out.print(metrics_table({"this run": score}, problem))

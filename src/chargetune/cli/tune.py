@@ -224,7 +224,9 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
-    screen.print(f"\n[bold]{escape(problem.cell.name)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    screen.print(f"\n[bold]{escape(problem.cell.title)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    for line in problem.setting_lines:
+        screen.print(f"[dim]{escape(line)}[/]")
     if problem.cell.remark:
         screen.print(f"[dim]{escape(problem.cell.remark)}[/]")
     screen.print(f"[dim]estimator {problem.estimator.line}[/]")

@@ -149,11 +149,11 @@ def test_theta_may_be_any_number_of_the_observer(kind):
 
 def test_the_default_backoff_is_that_of_the_scalar_riccati_equation():
     """Of one integrating disturbance P^2 - q^2 P - q^2 r^2 = 0, the variance of its prediction."""
-    settings = OffsetFree(offset_drift_V=0.004, voltage_sd_V=0.003, resistance_rate=1.5)
+    settings = OffsetFree(offset_drift_V=0.004, voltage_sd_V=0.003, resistance_drift=0.15)
     own = controller_of(problem("offset_free", offset_free=settings))
     resistance = np.mean(np.array(dict(own.model.parameters)["R0_ohm"]) + np.array(dict(own.model.parameters)["R1_ohm"]))
     for current in (0.0, 6.0):
-        drift = resistance * current * 1.5 * (10.0 / 3600 / CELL.capacity_Ah * current)
+        drift = resistance * current * 0.15 * np.sqrt(10.0 / 3600 / CELL.capacity_Ah * current)
         q2, r2 = 0.004**2 * 10 / 60 + drift**2, 0.003**2
         wanted = np.sqrt(q2 / 2 + np.sqrt(q2**2 / 4 + q2 * r2))
         x = np.zeros(len(own.model.states))
@@ -222,8 +222,8 @@ def test_the_check_of_a_problem_tells_of_it():
         (lambda: OffsetFree(voltage_sd_V=0.0), ["offset_free: voltage_sd_V = 0.0"]),
         (lambda: OffsetFree(soc_from_rest=1), ["soc_from_rest = 1", "true or false"]),
         (
-            lambda: problem("offset_free", observer=(ObserverSetting("resistance_drift", 0.1, 1.0),)),
-            ["'resistance_drift'", "offset_drift_V"],
+            lambda: problem("offset_free", observer=(ObserverSetting("resistance_start_sd", 0.1, 1.0),)),
+            ["'resistance_start_sd'", "offset_drift_V"],
         ),
         (lambda: problem("open_loop", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["'voltage_sd_V'", "(none)"]),
         (lambda: problem("offset_free", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["voltage_sd_V = 0.002", "[0.1, 1]"]),

@@ -18,7 +18,18 @@ from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.validation import check_count
 
-__all__ = ["CAPACITY_MAX_AH", "PAIRS_MAX", "RESISTANCE_MAX_V", "Cell", "default_cell", "highest_voltage", "load_cell", "mismatched"]
+__all__ = [
+    "CAPACITY_MAX_AH",
+    "PACK",
+    "PACK_MAX",
+    "PAIRS_MAX",
+    "RESISTANCE_MAX_V",
+    "Cell",
+    "default_cell",
+    "highest_voltage",
+    "load_cell",
+    "mismatched",
+]
 
 # R-C pairs of a circuit; more cannot be told apart in measured pulses.
 PAIRS_MAX = 3
@@ -63,9 +74,7 @@ class Cell:
     voltage_min_V: Annotated[float, Field(description="Lower limit of the terminal voltage, V; 0.5 to 5, below the OCV of the full cell.")]
     voltage_max_V: Annotated[
         float,
-        Field(
-            description="Upper limit of the terminal voltage, V; 0.5 to 5, at most 0.2 V above the OCV of the full cell, 0.5 V where that is below 3.7 V."
-        ),
+        Field(description="Upper limit of the terminal voltage, V; at most 5, and 0.2 V (flat OCV: 0.5 V) above that of the full cell."),
     ]
     soc: Annotated[tuple[float, ...], Field(description="SOC of the circuit's tables, 1; increasing within 0 to 1, at least 2.")]
     R0_ohm: Annotated[tuple[float, ...], Field(description="Ohmic resistance over soc, ohm; more than 0, at most 2 V / capacity_Ah.")]

@@ -114,7 +114,7 @@ class DateTimes:
             self.by_order[order] = moments - moments[0]
 
     def best(self) -> tuple[str, NDArray[np.float64]]:
-        """The order of day and month that lets time run without a jump of days. Raises ValueError where two do, or none."""
+        """The order of day and month ("": any) that lets time run without a jump, and s. Raises ValueError where two do, or none."""
         running = {o: t for o, t in self.by_order.items() if np.all(np.diff(t) >= 0)} or self.by_order
         if not running:
             raise ValueError("a date, as 2024-05-06 08:00:00")
@@ -123,7 +123,8 @@ class DateTimes:
         for other, seconds in running.items():
             if not np.array_equal(seconds, running[order]) and gaps[other] < 2 * gaps[order] + 60:
                 raise ValueError("dates of one order of day and month; write them as 2024-05-06 08:00:00")
-        return order, running[order]
+        alike = [other for other, seconds in running.items() if np.array_equal(seconds, running[order])]
+        return (order if len(alike) == 1 else ""), running[order]
 
 
 def dates(cells: Sequence[str]) -> DateTimes | None:

@@ -57,6 +57,9 @@ def signed_by_state(name: str, current: NDArray[np.float64], states: Sequence[st
 
 def _kind(state: str) -> int:
     word = re.sub(r"[\s_-]", "", state).upper()
+    begins = state.strip().upper()[:2]
+    if begins in {"C_", "D_"}:
+        return 1 if begins == "C_" else -1
     if word == "D" or re.search(r"DIS|DCH|DSCH|ENTLAD|放", word):
         return -1
     if word == "C" or re.search(r"CHA|CHG|CHRG|LADEN|充", word):

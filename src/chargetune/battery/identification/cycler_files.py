@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.battery.cell.cell import PACK, PACK_MAX
 from chargetune.battery.identification.cells import clock_seconds, dates, decimal_mark, number
 from chargetune.battery.identification.clocks import DAY_S, Clock, elapsed
 from chargetune.battery.identification.current_sign import Sign, signed_by_state
@@ -23,6 +24,7 @@ from chargetune.battery.identification.layouts import NEEDED, UNITS
 from chargetune.battery.identification.plausibility import checked
 from chargetune.battery.identification.record import Record
 from chargetune.battery.identification.samples import Samples, read_samples
+from chargetune.battery.validation import check_count
 
 __all__ = ["Reading", "read_record"]
 
@@ -41,15 +43,22 @@ DATES_SHARE, DATES_READ = 0.02, 200
 
 @dataclass(frozen=True)
 class Reading:
-    """What a file leaves open: ``sign`` of its current, ``time_unit`` (s, ms, min, h, hh:mm, mm:ss), ``current_unit`` (A, mA)."""
+    """What a file leaves open: ``sign`` of its current, ``time_unit`` (s, ms, min, h, hh:mm, mm:ss), ``current_unit`` (A, mA).
+
+    ``series`` and ``parallel``: it was measured on a pack of so many cells, and the record is that of one of them.
+    """
 
     sign: Sign | None = None
     time_unit: str | None = None
     current_unit: str | None = None
+    series: int = 1
+    parallel: int = 1
 
     def __post_init__(self) -> None:
         if self.sign not in {None, "charge", "discharge", "unsigned"}:
             raise ValueError(f"sign = {self.sign!r}, allowed are charge, discharge and unsigned")
+        for count in PACK:
+            check_count(count, getattr(self, count), 1, PACK_MAX)
         for name, quantity in (("time_unit", "time"), ("current_unit", "current")):
             unit = getattr(self, name)
             if unit is not None and unit_of(unit) not in ({*UNITS[quantity], *CLOCKS} if quantity == "time" else {*UNITS[quantity]}) - {""}:
@@ -80,6 +89,11 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
             if quantity in NEEDED:
                 raise
             remarks.append(f"the temperature was left out ({str(error).removeprefix(name + ', ')})")
+    if (options.series, options.parallel) != (1, 1):
+        for quantity, count in (("voltage", options.series), ("counter", options.series), ("current", options.parallel)):
+            if quantity in arrays:
+                arrays[quantity] = arrays[quantity] / count
+        remarks.append(f"of a pack: voltage was divided by {options.series} in series, current by {options.parallel} in parallel")
     _units(name, columns, arrays, assumed)
     raw, of_day = _time(samples, columns[source], mark, assumed, remarks)
     current = arrays["current"]
@@ -147,7 +161,7 @@ def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remar
             order, seconds = moments.best()
         except ValueError as error:
             raise ValueError(f"{samples.name}: {column.heading} = {cells[0]!r} to {cells[-1]!r}, allowed are {error}") from None
-        remarks.append(f"time is from the dates in {column.heading} ({ORDERS[order]})")
+        remarks.append(f"time is from the dates in {column.heading}" + (f" ({ORDERS[order]})" if order else ""))
         return seconds, False
     if mark == "." and (quick := _plain(cells)) is not None:
         values, clocks, left = [column.factor * value for value in quick], 0, []

@@ -151,7 +151,8 @@ NAMES: dict[str, tuple[str, ...]] = {
         "auxtemp1", "temperature1", "temp1", "temperaturea1", "auxt1", "t1", "tc1", "t", "temperatur", "温度", "chambertemperature",
         "environmenttemperature", "ambienttemperature",
     ),
-    "state": ("state", "status", "md", "steptype", "stepname", "command", "mode", "stepmode", "zustand", "状态", "工步类型"),
+    "state": ("state", "status", "md", "steptype", "stepname", "command", "mode", "stepmode", "stepstate", "workmode",
+        "zustand", "状态", "工步类型"),
 }  # fmt: skip
 
 # Factors to SI by quantity; "" is a heading without a unit. Clocks (h:mm:ss) are in seconds whatever their heading says.

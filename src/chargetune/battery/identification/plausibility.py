@@ -48,7 +48,7 @@ def _refuse_nonsense(record: Record) -> None:
         k = int(np.argmax(outside))
         raise ValueError(
             f"{record.source}, sample {k + 1}: voltage is {record.voltage_V[k]:g} V, allowed is {low:g} to {high:g} V "
-            "(was it given in mV? is it a pack?)"
+            "for one cell (was it given in mV? of a pack: --series and --parallel)"
         )
     largest = float(np.max(np.abs(record.current_A)))
     if not 0 < largest <= CURRENT_MAX_A:

@@ -208,6 +208,8 @@ def cell_toml(cell: Cell, notes: Sequence[str] = ()) -> str:
         f"{key} = {getattr(cell, key):.7g}"
         for key in ("capacity_Ah", "coulombic_efficiency", "current_max_A", "voltage_min_V", "voltage_max_V")
     ]
+    if (cell.series, cell.parallel) != (1, 1):
+        lines += [f"series = {cell.series} # cells of the pack; every number here is of one cell", f"parallel = {cell.parallel}"]
     lines += ["", "[ecm] # over SOC: ohm, farad", f"soc = {row(cell.soc)}"]
     lines += [f"{key} = {row(getattr(cell, key))}" for key in cell.tables]
     lines += ["", "[ocv] # open-circuit voltage, V", f"soc = {row(cell.ocv_soc)}", f"V = {row(cell.ocv_V)}"]

@@ -91,7 +91,7 @@ def _samples(name: str, table: Table, at: int, columns: dict[str, Column], other
                 f"{name}, row {number} has {len(row)} cells, allowed are {width} as in the header "
                 "(decimal commas need semicolons or tabs between columns)"
             )
-        if count == len(below) and len(row) <= max(places) < width:
+        if count == len(below) > 1 and len(row) <= max(places) and len(row) < len(below[-2][1]):
             remarks.append(f"the last row ({number}) is cut off and was left out")
             continue
         picked = [row[k].strip() if k < len(row) else "" for k in places]

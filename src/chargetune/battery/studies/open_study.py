@@ -30,8 +30,8 @@ def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
 def _over_range(problem: ChargingProblem) -> RangeEvaluation:
     if problem.range is None:
         raise ValueError("tuner = 'range' is given without a table [range], which says what differs between the charges")
-    if problem.plant is not None:
-        raise ValueError("tuner = 'range' is given with [plant], allowed is the cell's own circuit, of which hundreds are drawn")
+    if problem.plant_cell is None:
+        raise ValueError("tuner = 'range' is given with an electrochemical [plant], allowed is a circuit, of which hundreds are drawn")
     from chargetune import learning
 
     return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws)

@@ -72,5 +72,5 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.1)
         figure.align_ylabels()
-        cell_note(figure, problem.cell.name, problem.cell.remark)
+        cell_note(figure, problem.cell.title, problem.cell.remark)
     return figure

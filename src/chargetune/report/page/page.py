@@ -28,10 +28,10 @@ def report_page(view: StudyView, *, evaluate: bool = True, progress: Callable[[]
     """The page as HTML.
 
     ``evaluate`` runs the best theta again, and its neighbours, on the simulated plant; ``progress`` is called after each entry of
-    theta. It is done only where the plant is the cell's own circuit, which takes milliseconds an episode.
+    theta. It is done only where the plant is a circuit, which takes milliseconds an episode.
     """
     best, untuned = view.tuned, view.untuned
-    quick = evaluate and view.problem is not None and view.problem.plant is None and best is not None
+    quick = evaluate and view.problem is not None and view.problem.plant_cell is not None and best is not None
     moved = finite_differences(view, best, progress) if quick and best is not None else []
     names = [("untuned", untuned, "untuned", "")]
     if best is not None:

@@ -65,16 +65,15 @@ def what_was_tuned(view: StudyView) -> str:
     problem, head = view.problem, study_head(view)
     parts = []
     if problem is not None:
-        plant = "its own circuit, simulated" if problem.plant is None else repr(problem.plant)
         control, charge = problem.controller, problem.episode
         seed = control.mismatch_seed
         own = "the plant's own" if problem.plant is None else "those of the cell file's circuit"
         belief = own if seed is None else f"wrong by the factors of mismatch seed {seed}"
         start = "of the range of use" if view.over_range and problem.range and problem.range.soc_start else f"{charge.soc_start:g}"
         facts = [
-            ("cell", problem.cell.name),
+            ("cell", problem.cell.title),
             ("capacity", f"{problem.cell.capacity_Ah:g} Ah"),
-            ("plant", plant),
+            ("plant", problem.plant_line),
             ("controller's parameters", belief),
             ("estimator", problem.estimator.line),
             ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
@@ -84,11 +83,13 @@ def what_was_tuned(view: StudyView) -> str:
             ),
             ("tuner", view.tuner),
         ]
+        if problem.cell.pack_line:
+            facts.insert(1, ("pack", problem.cell.pack_line))
         if problem.range is not None:
             facts.insert(-1, ("range of use", problem.range.line))
         parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts]))
         if view.remark:
-            parts.append(paragraph(f"{problem.cell.name}: {view.remark}", "faint"))
+            parts.append(paragraph(f"{problem.cell.title}: {view.remark}", "faint"))
         rows = [(x["name"], float(x["bound"]), x["unit"], float(x["tolerance"]), x["kind"]) for x in head["limits"]]
         parts.append(table(("limit", "bound", "unit", "tolerance", "in the controller"), rows))
     else:
