@@ -429,6 +429,10 @@ def main() -> None:
         if ended.code == INTERRUPTED:
             _interrupted()
         raise
+    except KeyboardInterrupt:
+        # Before the command had begun.
+        _interrupted()
+        sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
         if type(error) is ValueError or isinstance(error, OSError):
             _refuse(error)

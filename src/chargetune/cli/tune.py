@@ -79,7 +79,8 @@ def tune_command(
     _check(problem, problem.safe_start, force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
     everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
-    summary = {**_summary(config, everything, result, problem.space.entries), "store": shown(kept)}
+    now = [t for t in everything if t.status is not TrialStatus.APART]
+    summary = {**_summary(config, now, result, problem.space.entries), "apart": len(everything) - len(now), "store": shown(kept)}
     summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
@@ -90,15 +91,15 @@ def tune_command(
         figures = save_figures(kept, config.study.name, out, trials=count)
     if as_json:
         print(json.dumps(summary))  # noqa: T201
-        _end(safety, everything)
+        _end(safety, now)
         return
-    _closing(problem, everything, result)
+    _closing(problem, now, result)
     if safety:
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
     console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
-    _end(safety, everything)
+    _end(safety, now)
 
 
 def _files(out: Path, config: Config, problem: ChargingProblem, kept: str) -> list[Output]:
