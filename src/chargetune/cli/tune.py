@@ -80,14 +80,14 @@ def tune_command(
     opening = Opening(config, path.parent, kept, accept_changed)
     everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
     now = [t for t in everything if t.status is not TrialStatus.APART]
-    summary = {**_summary(config, now, result, problem.space.entries), "apart": len(everything) - len(now), "store": shown(kept)}
+    summary = {**_summary(config, now, result, problem.space.entries), "apart": len(everything) - len(now)}
     summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
 
         # First what says whose folder this is.
-        write_whole(out / "summary.json", json.dumps(summary, indent=1))
+        write_whole(out / "summary.json", json.dumps({**summary, "store": shown(kept)}, indent=1))
         figures = save_figures(kept, config.study.name, out, trials=count)
     if as_json:
         print(json.dumps(summary))  # noqa: T201
