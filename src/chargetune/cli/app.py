@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
+from chargetune.cli.terminal import any_terminal
 from chargetune.runtime.interrupts import INTERRUPTED, Watch, handled_interrupts
 
 __all__ = ["app", "main"]
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
+store_app = typer.Typer(name="store", help="Check, salvage, export or migrate a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
 # EX_SOFTWARE of sysexits.h.
 DEFECT = 70
@@ -108,6 +109,7 @@ def tune(
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
+    _read_first(config, "study")
     from chargetune.cli.tune import tune_command
 
     tune_command(
@@ -135,6 +137,7 @@ def campaign(
     as_json: AsJson = False,
 ) -> None:
     """Tune many study files with many seeds. The same command again resumes."""
+    _read_first(file, "campaign")
     from chargetune.cli.campaign import campaign_command
 
     campaign_command(file, store=store, workers=workers, force=force, as_json=as_json)
@@ -149,6 +152,7 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Find errors of a formulation before anything is tuned; exit code 1 when there are any."""
+    _read_first(config, "study")
     from chargetune.cli.check import check_command
 
     check_command(config, safe=safe, figures=figures, overwrite=overwrite, as_json=as_json)
@@ -164,6 +168,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Run one closed loop of a study file at one theta."""
+    _read_first(config, "study")
     from chargetune.cli.simulate import simulate_command
 
     simulate_command(config, theta=theta, seed=seed, as_json=as_json)
@@ -312,6 +317,7 @@ def compare(
 
     With a table [range]: plants that are drawn from it, with violations and mean times.
     """
+    _read_first(config, "study")
     from chargetune.cli.compare import compare_command
 
     compare_command(
@@ -434,11 +440,23 @@ def store_export(
 
 
 @store_app.command("migrate")
-def store_migrate(store: StoreArgument) -> None:
+def store_migrate(store: StoreArgument, as_json: AsJson = False) -> None:
     """Convert a store of an older version; a copy of the old file stays beside it."""
     from chargetune.cli.store import migrate_command
 
-    migrate_command(store)
+    migrate_command(store, as_json=as_json)
+
+
+def _read_first(path: Path, kind: str) -> None:
+    """Refuse a file with a wrong key before anything heavy is imported, so that the answer comes at once."""
+    from chargetune.battery.studies import study_file
+
+    if kind == "study":
+        study_file.load_config(path)
+    else:
+        from chargetune.battery.studies.campaign_file import CampaignFile
+
+        study_file.read_tables(path, CampaignFile)
 
 
 # What --debug said, for who reports an error after the command has ended.
@@ -473,13 +491,17 @@ def main() -> None:
     """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
     try:
-        with handled_interrupts(Watch(_stopping, _interrupted)):
+        with any_terminal(), handled_interrupts(Watch(_stopping, _interrupted)):
             app()
     except SystemExit as ended:
         # That is what typer makes of KeyboardInterrupt, without a word.
         if ended.code == INTERRUPTED:
             _interrupted()
         raise
+    except KeyboardInterrupt:
+        # Before the command had begun.
+        _interrupted()
+        sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
         if type(error) is ValueError or isinstance(error, OSError):
             _refuse(error)

@@ -58,7 +58,7 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
         for row in rows:
             if row.message is not None:
                 console().print(f"[red]{escape(row.name)}[/] stopped: {escape(row.message)}")
-        console().print(f"trials in {shown(kept)}")
+        console().print(f"trials in {shown(kept)}", markup=False, soft_wrap=True)
     if stopped:
         sys.exit(1)
 

@@ -114,8 +114,10 @@ def certify_command(
         return
     screen = console()
     _print(certificate)
-    screen.print(f"certificate {target}\ntraces {target.with_name(certificate['traces']['file'])}\nfigure {figure}", soft_wrap=True)
-    screen.print(f"[dim]recompute every figure from the traces: chargetune verify {target}[/]", soft_wrap=True)
+    traces = target.with_name(certificate["traces"]["file"])
+    screen.print(f"certificate {target}\ntraces {traces}\nfigure {figure}", markup=False, soft_wrap=True)
+    line = f"recompute every figure from the traces: chargetune verify {target}"
+    screen.print(line, style="dim", markup=False, soft_wrap=True)
 
 
 def _with_range(problem: ChargingProblem, changes: Mapping[str, Any]) -> tuple[ChargingProblem, str]:
@@ -130,11 +132,11 @@ def _print(certificate: dict[str, Any]) -> None:
     f, origin = certificate["figures"], certificate["origin"]
     screen = console()
     screen.print(
-        f"[bold]{escape(certificate['cell']['name'])}[/], study {origin['study']!r}, trial {origin['trial']}: "
+        f"[bold]{escape(certificate['cell']['name'])}[/], study {escape(repr(origin['study']))}, trial {origin['trial']}: "
         f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
         soft_wrap=True,
     )
-    screen.print(f"[dim]trial {origin['trial']}: {origin['why']}[/]", soft_wrap=True)
+    screen.print(f"trial {origin['trial']}: {origin['why']}", style="dim", markup=False, soft_wrap=True)
     if certificate["cell"]["remark"]:
         screen.print(f"[dim]{escape(certificate['cell']['remark'])}[/]")
     bound, confidence = f["violation_probability_upper"], certificate["confidence"]

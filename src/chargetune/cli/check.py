@@ -48,7 +48,7 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
         print(json.dumps({"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}))  # noqa: T201
     else:
         print_findings(findings, screen)
-        screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), soft_wrap=True)
+        screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)
     if any(f.severity == "error" for f in findings):
         sys.exit(1)
 

@@ -43,7 +43,7 @@ def compare_command(
         check_format(figure)
     config = load_config(path)
     if figure is not None:
-        read = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
+        read: list[str | Path] = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
         claim([Output("--figure", figure, figure_kind(figure))], inputs=read, overwrite=overwrite, folders=False)
     problem = config.problem(path.parent)
     result = None if store is None else _result(store, study or config.study.name)
@@ -86,7 +86,7 @@ def compare_command(
         "constant backoff with which every limit is kept.[/]"
     )
     if result is not None:
-        screen.print(f"[dim]Tuned MPC: {result_line(result)}[/]", soft_wrap=True)
+        screen.print(f"Tuned MPC: {result_line(result)}", style="dim", markup=False, soft_wrap=True)
     if store is None:
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:

@@ -94,12 +94,14 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
             f"{found['holds']} of {found['of']}" if found["of"] else "needs the other study in the same --out",
         )
     screen.print(table)
-    screen.print(f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")))
+    screen.print(
+        f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")), markup=False, soft_wrap=True
+    )
 
 
 def _is_claims(path: Path) -> bool:
     try:
-        return {"case", "tuner", "claims", "per_seed"} <= json.loads(path.read_text(encoding="utf-8")).keys()
+        return bool({"case", "tuner", "claims", "per_seed"} <= json.loads(path.read_text(encoding="utf-8")).keys())
     except (OSError, ValueError, AttributeError):
         return False
 

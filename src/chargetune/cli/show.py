@@ -53,6 +53,7 @@ def _summary(record: StudyRecord, trials: list[Trial], result: StudyResult) -> d
         "created_at": record.created_at,
         "done": sum(t.status is TrialStatus.DONE for t in trials),
         "failed": sum(t.status is TrialStatus.FAILED for t in trials),
+        "apart": sum(t.status is TrialStatus.APART for t in trials),
         "running": sum(t.status is TrialStatus.RUNNING for t in trials),
         "violating": sum(t.score is not None and not t.score.feasible for t in trials),
         "best": _trial(best) if best else None,

@@ -16,6 +16,7 @@ from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.study.store.damaged_reader import Damage
 from chargetune.study.store.integrity import check_store
 from chargetune.study.store.salvage import salvage
+from chargetune.study.store.schema import SCHEMA_VERSION
 from chargetune.study.store.store import Store
 
 __all__ = ["check_command", "export_command", "migrate_command", "salvage_command"]
@@ -73,10 +74,15 @@ def export_command(location: str, *, out: Path, study: str | None, form: Format,
     console().print(f"{len(written.files)} files in {out}", markup=False, soft_wrap=True)
 
 
-def migrate_command(location: str) -> None:
+def migrate_command(location: str, *, as_json: bool) -> None:
     """Bring a store of an older schema to this one; opening it for writing does that."""
+    if "://" not in location and not Path(location).exists():
+        raise ValueError(f"{location}: no such store")
     with Store(location):
         pass
+    if as_json:
+        print(json.dumps({"store": shown(location), "schema_version": SCHEMA_VERSION}))  # noqa: T201
+        return
     console().print(f"{shown(location)}: has this program's schema", markup=False, soft_wrap=True)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column
 
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.charging.problem import ChargingProblem
@@ -25,6 +26,7 @@ from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines, workers_for
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
+from chargetune.runtime.notes import first_line
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
 from chargetune.study.result import StudyResult, read_result
@@ -36,14 +38,14 @@ __all__ = ["bar", "tune_command"]
 
 
 def bar(*, quiet: bool) -> Progress:
-    """A progress bar on stderr, so that a program can read stdout."""
+    """A progress bar on stderr, so that a program can read stdout. At 80 columns the note is what goes on in a second line."""
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[note]}", markup=False, table_column=Column(overflow="fold")),
     )
     return Progress(*columns, console=console(stderr=True), disable=quiet)
 
@@ -78,27 +80,30 @@ def tune_command(
         out.mkdir(parents=True, exist_ok=True)
     _check(problem, problem.safe_start, force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
-    everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
-    summary = {**_summary(config, everything, result, problem.space.entries), "store": shown(kept)}
+    everything, more, result, safety = _run(opening, problem, count, workers, quiet=as_json)
+    now = [t for t in everything if t.status is not TrialStatus.APART]
+    summary = {**_summary(config, now, result, problem.space.entries), "trials": len(everything), "apart": len(everything) - len(now)}
     summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
 
         # First what says whose folder this is.
-        write_whole(out / "summary.json", json.dumps(summary, indent=1))
+        write_whole(out / "summary.json", json.dumps({**summary, "store": shown(kept)}, indent=1))
         figures = save_figures(kept, config.study.name, out, trials=count)
     if as_json:
         print(json.dumps(summary))  # noqa: T201
-        _end(safety, everything)
+        _end(safety, now)
         return
-    _closing(problem, everything, result)
+    _closing(problem, now, result)
+    if more:
+        console().print(f"the study has {len(everything) + more} trials; these are the first {len(everything)} of them, as --trials asks")
     if safety:
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
-    console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
-    _end(safety, everything)
+    console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures), markup=False, soft_wrap=True)
+    _end(safety, now)
 
 
 def _files(out: Path, config: Config, problem: ChargingProblem, kept: str) -> list[Output]:
@@ -128,8 +133,8 @@ class Opening:
 
 def _run(
     opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool
-) -> tuple[list[Trial], StudyResult, dict[str, Any] | None]:
-    """The trials of the study, its result, and what there is to say of safety."""
+) -> tuple[list[Trial], int, StudyResult, dict[str, Any] | None]:
+    """The trials of the study that are asked for, how many more it has, its result, and what there is to say of safety."""
     config, kept = opening.config, opening.kept
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
@@ -147,7 +152,7 @@ def _run(
         if study.earlier and not quiet:
             progress.console.print(f"begun with {len(study.earlier)} trials of earlier studies")
         if done and not quiet:
-            progress.console.print(f"resumed: {done} trials are in {shown(kept)}")
+            progress.console.print(f"resumed: {done} trials are in {shown(kept)}", markup=False, soft_wrap=True)
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
@@ -166,12 +171,13 @@ def _run(
             study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
-        everything = study.trials()[:count]
+        stored = study.trials()
+        everything, more = stored[:count], max(0, len(stored) - count)
         safety = _safety(config, problem, study, everything, stopped)
         # After a study that stopped, too.
         study.result()
         result = read_result(store, study.record, everything)
-    return everything, result, safety
+    return everything, more, result, safety
 
 
 @contextmanager
@@ -179,7 +185,7 @@ def _said(screen: Console) -> Iterator[None]:
     """Warnings of a tuner as lines above the progress bar."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", RuntimeWarning)
-        warnings.showwarning = lambda message, *_, **__: screen.print(f"[yellow]{escape(str(message))}[/]")
+        warnings.showwarning = lambda message, *_, **__: screen.print(f"note: {first_line(message)}", style="yellow", markup=False)
         yield
 
 
@@ -230,6 +236,10 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     if problem.cell.remark:
         screen.print(f"[dim]{escape(problem.cell.remark)}[/]")
     screen.print(f"[dim]estimator {problem.estimator.line}[/]")
+    if all(t.score is None for t in everything):
+        # There is nothing that a table could show.
+        screen.print(result_line(result), markup=False, soft_wrap=True)
+        return
     first = everything[0].score if everything else None
     # A safe study does not begin with the untuned controller.
     label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"
@@ -239,7 +249,7 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     if not best.feasible:
         screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
     units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
-    screen.print(result_line(result), soft_wrap=True)
+    screen.print(result_line(result), markup=False, soft_wrap=True)
     screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
 
 from chargetune.cli.output import console
@@ -28,7 +29,7 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
     with Store(location, read_only=True) as store:
         label = store.label  # what cannot be shown is refused now
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family) as listening:
+    with _listening(host, port, family) as listening:
         bound = listening.getsockname()[1]
         config = uvicorn.Config(
             make_app(location, token=token, hosts=frozenset({host.lower()}), ending=lambda: server.should_exit),
@@ -40,7 +41,16 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
         server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
-        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
+        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", markup=False, soft_wrap=True)
         # uvicorn passes Ctrl-C on once it has ended in good order.
         with contextlib.suppress(KeyboardInterrupt), unwatched():
             server.run(sockets=[listening])
+
+
+def _listening(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise ValueError(f"--port {port} is taken on {host} by another program; --port 0 takes a free one") from error
+        raise

@@ -7,6 +7,7 @@ thetas, seeds and mismatches builds it once. It gives the same trajectory as `ru
 from __future__ import annotations
 
 import hashlib
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -220,6 +221,12 @@ def compiled_episode(
     key = f"episode {controller.structure} {own} {steps} {use and compiler_flags()} {compiled is None} {indices} {lookup_table}"
 
     def build() -> tuple[ca.Function, ca.Function, bool]:
+        if compiled is None and not use and "CHARGETUNE_CC" not in os.environ:
+            warnings.warn(
+                "there is no C compiler: episodes run on the virtual machine, about 8 times slower; install gcc or clang",
+                RuntimeWarning,
+                stacklevel=5,
+            )
         try:
             return *(_compiled if use else _built)(controller, plant, indices, steps, lookup_table), use
         except (RuntimeError, OSError) as error:

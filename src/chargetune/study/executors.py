@@ -15,6 +15,8 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from types import FrameType, TracebackType
 from typing import ParamSpec, TypeVar
 
+from chargetune.runtime.notes import say_warnings_as_notes
+
 __all__ = ["ProcessExecutor", "bounded_workers", "process_executor"]
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -173,6 +175,7 @@ def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    say_warnings_as_notes()
     torch = sys.modules.get("torch")
     if torch is not None:
         torch.set_num_threads(1)

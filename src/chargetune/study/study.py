@@ -20,13 +20,14 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.runtime.interrupts import raise_lost_interrupt
+from chargetune.study.changes import Carry, carried_over
 from chargetune.study.dataframe import study_html, trials_dataframe
 from chargetune.study.evaluation import Evaluate, trial_seed
 from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.result import StudyResult, by_performance, made_from, read_result, with_belief
+from chargetune.study.result import StudyResult, allowed, by_performance, made_from, read_result, with_belief
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
 from chargetune.study.serialization import canonical_json, score_to_json, sha256
@@ -86,6 +87,7 @@ class Study:
         hardware: bool = False,
         earlier: Sequence[Earlier] = (),
         accept_changed: bool = False,
+        carry: Carry | None = None,
     ) -> Self:
         """The study ``name`` of the store, begun if there is none.
 
@@ -97,8 +99,11 @@ class Study:
             Studies whose told trials are its initial data D_0: the tuner gets them before its own. They are copied when the study is
             begun, with traces and origin, and keep numbers below 0; `trials` and `best` leave them out.
         accept_changed
-            Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units, and
-            ``earlier`` must be what it was.
+            Resume although something differs; the parameters must keep names, order and units, and ``earlier`` must be what it was.
+            Old trials outside of the bounds are set apart, see `carried_over`; back in them they count again.
+        carry
+            What is known of the configuration: old trials of another closed loop are then set apart, too, and judged again from
+            their traces where only the verdict changes. None: the old trials stay as they are.
 
         Raises ValueError for bad arguments; StudyError when what is resumed differs, or when another process holds the study.
         """
@@ -111,7 +116,7 @@ class Study:
         try:
             record = store.study(name)
             if check_change(record, identity, accept_changed=accept_changed):
-                store.change_study(record.id, identity)
+                store.change_study(record.id, identity, _carried(store, record, identity, space, carry))
                 record = store.study(name)
             term = store.note_holder(record.id, os.getpid(), socket.gethostname())
         except BaseException:
@@ -139,11 +144,11 @@ class Study:
 
     def best(self) -> Trial | None:
         """The trial of the largest objective that was measured to keep every limit; the `result` may be another."""
-        return best_feasible(self.trials())
+        return best_feasible(allowed(self.record, self.trials()))
 
     def best_performance(self) -> Trial | None:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
-        return best_performance(self.trials())
+        return best_performance(allowed(self.record, self.trials()))
 
     def result(self) -> StudyResult:
         """The result of the study as it stands, and why: the one that every command and page shows.
@@ -158,11 +163,12 @@ class Study:
         if known.asked:
             return known
         own = by_performance(self.record.identity)
-        found = with_belief(trials, lambda: self._believed_best(trials), by_performance=own)
+        count = allowed(self.record, trials)
+        found = with_belief(count, lambda: self._believed_best(count), by_performance=own)
         number = None if found.trial is None else found.trial.number
         made = ResultRecord(number, found.reason.value, made_from(self.record, trials))
         self.store.set_result(self.record.id, made, term=self.term)
-        return found
+        return replace(found, note=known.note)
 
     def _believed_best(self, trials: Sequence[Trial]) -> Trial | None:
         """The trial that the tuner believes best from all traces; None where it does not say, or names one of an earlier study."""
@@ -358,8 +364,8 @@ class Study:
         return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
 
     def _traced(self, trials: Sequence[Trial]) -> list[Trial]:
-        """Earlier studies' trials and these, each with a reader of its episode where it has a trace."""
-        known = [*self.earlier, *trials]
+        """Earlier studies' trials and those of these that count, each with a reader of its episode where it has a trace."""
+        known = [*self.earlier, *allowed(self.record, trials)]
         return [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in known]
 
     def episode(self, number: int) -> Episode | None:
@@ -373,7 +379,7 @@ class Study:
 
     def _record(self, first: int, thetas: Sequence[tuple[float, ...]], known: Sequence[Trial], **more: Any) -> list[Trial]:
         # A tuner, and the twin in it, is a pure function of the trials it was given, so these are its whole state.
-        state = [[t.number, list(t.theta), *result_of(t)] for t in (*self.earlier, *known)]
+        state = [[t.number, list(t.theta), *result_of(t)] for t in (*self.earlier, *allowed(self.record, known))]
         made_with = {**self._provenance(), "learnt_sha256": sha256(canonical_json(state, "trials")), **more}
         now = utc_now()
         trials = [
@@ -387,9 +393,20 @@ class Study:
         return {"study_sha256": self.record.identity_sha256, "versions": versions()}
 
 
+def _carried(store: Store, record: StudyRecord, identity: Mapping[str, Any], space: ParameterSpace, carry: Carry | None) -> list[Trial]:
+    def episode(number: int) -> Episode | None:
+        trace = store.trace(record.id, number)
+        return None if trace is None else Episode.from_arrays(*trace)
+
+    new_sha256 = sha256(canonical_json(identity, "study"))
+    return carried_over(
+        store.trials(record.id), old=record.identity, new=identity, new_sha256=new_sha256, space=space, carry=carry, episode=episode
+    )
+
+
 def _refuse_sameness(trials: Sequence[Trial]) -> None:
     """StudyError when the first trials failed, as many as there are, and all for the same reason."""
-    told = [t for t in trials if t.status is not TrialStatus.RUNNING]
+    told = [t for t in trials if t.status in (TrialStatus.DONE, TrialStatus.FAILED)]
     # A loop that was ended at a limit says something of its theta.
     failed = all(t.score is None and not (t.ending or "").startswith(Ending.LIMIT.value) for t in told)
     if failed and len(told) == SAME_FAILURES and len({t.ending for t in told}) == 1:

@@ -97,8 +97,9 @@ class ResistanceRatio:
     scale: bool = False
 
     def __post_init__(self) -> None:
-        check_number("resistance ratio: lower", self.lower, 0.001, 0.999)
-        check_number("resistance ratio: upper", self.upper, 1.001, 100.0)
+        # The untuned controller's own resistance lies between them.
+        check_number("resistance ratio: lower", self.lower, 0.001, 0.999, "below 1, the untuned ratio")
+        check_number("resistance ratio: upper", self.upper, 1.001, 100.0, "above 1, the untuned ratio")
         if not isinstance(self.scale, bool):
             raise ValueError(f"resistance ratio: scale = {self.scale!r}, allowed is true or false")
 

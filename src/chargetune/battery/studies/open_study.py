@@ -11,6 +11,7 @@ from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.studies.carry_over import ChargingCarry
 from chargetune.battery.studies.study_file import Config, TunerName, TwinTable
 from chargetune.study.evaluation import Evaluate
 from chargetune.study.store.store import Store
@@ -101,4 +102,5 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         batch=config.study.batch,
         earlier=config.earlier(folder),
         accept_changed=accept_changed,
+        carry=ChargingCarry(problem),
     )

@@ -7,9 +7,9 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator
 
 from chargetune.battery.cell.cell import PACK, PACK_MAX, Cell, default_cell, load_cell
 from chargetune.battery.cell.plating import Anode
@@ -31,7 +31,11 @@ from chargetune.battery.charging.settings import (
 from chargetune.battery.charging.tunables import Tunables
 from chargetune.battery.plants.circuit import Circuit
 from chargetune.battery.plants.electrochemical import Electrochemical
-from chargetune.study.warm_start import Earlier
+from chargetune.battery.studies.file_errors import plain_errors
+from chargetune.study.names import check_name
+
+if TYPE_CHECKING:
+    from chargetune.study.warm_start import Earlier
 
 __all__ = ["Config", "TunerName", "load_config", "problem_of_document", "read_tables"]
 
@@ -55,12 +59,17 @@ class EarlierTable(_Table):
 class StudyTable(_Table):
     """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time, earlier studies."""
 
-    name: str = Field(default="study", min_length=1, max_length=200)
+    name: str = "study"
     tuner: TunerName = "default"
     trials: int = Field(default=60, ge=1)
     seed: int = Field(default=0, ge=0)
     batch: int = Field(default=1, ge=1)
     earlier: list[EarlierTable] = Field(default_factory=list)
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str) -> str:
+        return check_name(name)
 
 
 class CellTable(_Table):
@@ -143,6 +152,9 @@ class Config(_Table):
 
     def earlier(self, folder: Path | None = None) -> list[Earlier]:
         """The earlier studies; a relative file is looked for in ``folder``."""
+        # Only here: it loads what reads a store.
+        from chargetune.study.warm_start import Earlier
+
         here = Path() if folder is None else folder
         return [Earlier(e.store if "://" in e.store else here / e.store, e.study) for e in self.study.earlier]
 
@@ -201,6 +213,13 @@ def _cell_document(cell: Cell) -> dict[str, Any]:
             del data[name]
     return data
 
+
+# A key at the top that only another kind of file has, the model of that kind, and what to do with it.
+OTHER_FILES = {
+    "campaign": ("CampaignFile", "a campaign file, which `chargetune campaign` takes"),
+    "capacity_Ah": ("", "a cell file; a study names it in its table [cell], file = ..."),
+    "study": ("Config", "a study file, which `chargetune tune` takes; a campaign names it in [campaign], configs = [...]"),
+}
 
 # What older files and stores call the kind of the estimator.
 OVERPOTENTIAL = {"model": "open_loop", "exact": "exact"}
@@ -275,15 +294,6 @@ def read_tables(path: str | Path, model: type[T]) -> T:
         # A dataclass is made from a table of JSON, but in strict mode not from a dict. JSON has no dates, and no key here is one.
         return model.model_validate_json(json.dumps(data, default=lambda date: {"date": str(date)}))
     except ValidationError as error:
-        raise ValueError("\n".join(f"{path}: {_plain(problem)}" for problem in error.errors())) from None
-
-
-def _plain(problem: Any) -> str:
-    field = ".".join(str(part) for part in problem["loc"] if part not in (CELL_PLANT, MODEL_PLANT))
-    if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{field} is not a known key"
-    if problem["type"] == "value_error":
-        # What a table says of its own entries names field, value and what is allowed.
-        return f"{field}: {problem['ctx']['error']}"
-    message = problem["msg"]
-    return f"{field} = {problem['input']!r}: {message[0].lower()}{message[1:]}"
+        lines = [f"{path}: {line}" for line in plain_errors(error.errors(), model)]
+        other = next((said for key, (kind, said) in OTHER_FILES.items() if key in data and model.__name__ != kind), None)
+        raise ValueError("\n".join([f"{path}: {other}"] if other else lines)) from None

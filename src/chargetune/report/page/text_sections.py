@@ -25,10 +25,11 @@ def opening(view: StudyView) -> str:
     failed = sum(t.status is TrialStatus.FAILED for t in view.trials)
     running = sum(t.status is TrialStatus.RUNNING for t in view.trials)
     counts = f"{len(view.trials)} trials: {len(done) - broke} within the limits, {broke} beyond one, {failed} failed"
-    more = f", {running} not told yet" if running else ""
+    apart = sum(t.status is TrialStatus.APART for t in view.trials)
+    more = (f", {apart} set apart" if apart else "") + (f", {running} not told yet" if running else "")
     best = view.tuned
     if best is None:
-        verdict = paragraph("No trial has a score: there is no result.", "bad")
+        verdict = paragraph(f"There is no result: {view.result.sentence}.", "bad")
     elif not best.feasible:
         verdict = paragraph(f"The result, trial {best.number}, did not keep the limits{over}: {view.result.sentence}.", "bad")
     else:
