@@ -2,7 +2,11 @@
 // The figures of a page: one drawing function a kind, used by the report and by the live page alike.
 const Figures = (() => {
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-  const CONFIG = { displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+  // Allowed by name: what a newer plotly.js adds, such as a button that uploads the chart, does not appear unasked.
+  const CONFIG = {
+    displaylogo: false, plotlyServerURL: "", showSendToCloud: false, showLink: false,
+    modeBarButtons: [["toImage"], ["zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
+  };
 
   function axis(title, more) {
     const line = colour("line");
