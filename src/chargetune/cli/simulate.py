@@ -60,7 +60,7 @@ def simulate_command(path: Path, *, theta: str | None, seed: int, as_json: bool)
     )
     if problem.cell.remark:
         out.print(f"[dim]{escape(problem.cell.remark)}[/]")
-    out.print(metrics_table({"this run": score}, problem))
+    out.print(metrics_table({"this run": score}, problem, config.study.tuner))
 
 
 def parse_theta(text: str, problem: ChargingProblem, option: str) -> NDArray[np.float64]:

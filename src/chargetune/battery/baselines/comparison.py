@@ -18,7 +18,7 @@ from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
-__all__ = ["Row", "Verdict", "compare", "constant_backoff", "row_names", "smallest_that_keeps"]
+__all__ = ["Row", "Verdict", "compare", "constant_backoff", "plant_oracle", "row_names", "smallest_that_keeps"]
 
 # Shares of the largest current: of CC-CV, and of five steps in five equal SOC windows.
 CCCV_SHARES = (0.25, 0.5, 1.0)
@@ -85,6 +85,11 @@ def compare(
         return
     tasks: list[Future[Row]] = [executor.submit(_row, problem, name, theta, seed) for name in names]
     yield from (task.result() for task in as_completed(tasks))
+
+
+def plant_oracle(problem: ChargingProblem) -> Row | None:
+    """The charge at the largest current that keeps every limit in each interval; None where an interval of the plant cannot be tried."""
+    return _row(problem, "plant oracle", None, 0) if as_steppable(plant_of(problem)) is not None else None
 
 
 def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, seed: int) -> Row:
