@@ -168,12 +168,15 @@ def report(
     evaluate: Annotated[
         bool, typer.Option(help="Evaluate the best theta and its neighbours on a simulated plant, for the sensitivities.")
     ] = True,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of the study; by default the one beside the store, where it is of this study.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write one study as a self-contained HTML page, which opens offline."""
     from chargetune.cli.report import report_command
 
-    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, as_json=as_json)
+    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, certificate=certificate, as_json=as_json)
 
 
 @app.command()

@@ -158,7 +158,7 @@ def _own(name: str) -> bytes:
 @cache
 def _files() -> dict[str, tuple[dict[str, bytes], str]]:
     """Every file that a page may ask for: its content by encoding, and its type."""
-    contents = {name: static(name).encode() for name in ("look.css", "figures.js")}
+    contents = {name: static(name).encode() for name in ("look.css", "figures.js", "trials.js")}
     contents |= {name: _own(name) for name in ("index.js", "study.js")}
     contents["plotly.js"] = plotly_js()
     return {name: ({"": c, "gzip": gzip.compress(c, 6)}, TYPES[name.rpartition(".")[2]]) for name, c in contents.items()}

@@ -93,7 +93,7 @@ def trajectories_figure(view: StudyView) -> Figure:
         if grey:
             handles.append(Line2D([], [], color=GREY, linewidth=0.8, label="trials"))
         shown, tuned = [], view.tuned
-        for label, trial, color in (("untuned", view.untuned, BLUE), (view.tuned_label, tuned, ORANGE)):
+        for label, trial, color in ((view.start_label, view.start, BLUE), (view.tuned_label, tuned, ORANGE)):
             episode = view.episode(trial)
             if trial is None or episode is None:
                 continue
@@ -135,14 +135,19 @@ def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> list[Line2D]:
 
 def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, voltages: list[NDArray[np.float64]]) -> None:
     limit = problem.voltage_max_V
-    peak = np.nanmax(np.concatenate([[limit], *voltages]))
+    peak = float(np.nanmax(np.concatenate(voltages))) if voltages else limit
     # Wild trials leave this panel: it is there to show the runs before and after tuning.
     margin = max(0.02, 1.25 * (peak - limit))
     panels["near"].set_ylim(limit - 0.8 * margin, limit + margin)
+    if peak < limit - 0.8 * margin:
+        said = f"at most {peak:.3f} V: nothing came near the limit"
+        panels["near"].text(0.5, 0.3, said, transform=panels["near"].transAxes, ha="center", fontsize=7.5, color="0.35")
     for name, axis in panels.items():
         axis.set_ylabel(LABELS[name])
         if name != "near":
             axis.autoscale_view()
+    for axis in panels.values():
+        axis.tick_params(labelbottom=True)
     for axis in list(panels.values())[-2:]:
         axis.set_xlabel("time (min)")
     figure.align_ylabels()
