@@ -139,12 +139,14 @@ def simulate(
         str | None, typer.Option(help='Values: "0.1,0.1,..." or JSON by name: \'{"backoff_V": [...]}\'. The file\'s by default.')
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbances.")] = 0,
+    figure: Annotated[Path | None, typer.Option(help="Figure of the run to write (png, pdf, svg).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Trace of the run to write (CSV), one row an interval.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run one closed loop of a study file at one theta."""
     from chargetune.cli.simulate import simulate_command
 
-    simulate_command(config, theta=theta, seed=seed, as_json=as_json)
+    simulate_command(config, theta=theta, seed=seed, figure=figure, out=out, as_json=as_json)
 
 
 @app.command()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["convergence_figure", "drawn_limits", "excess_unit", "incumbents", "loss", "worst_excess"]
+__all__ = ["convergence_figure", "drawn_limits", "excess_unit", "incumbents", "linear_within", "loss", "worst_excess"]
 
 # Labels as matplotlib sets them.
 TYPESET = {"-G": "$-G$", "mean of (z_d - z)^2": "mean of $(z_d - z)^2$"}
@@ -101,10 +101,11 @@ def convergence_figure(view: StudyView) -> Figure:
             handles.append(upper.axhline(words.most, color=GREY, linestyle="-.", linewidth=0.8, label="above: not reached"))
         _scale(upper, worth)
         _limit_lines(lowers, limits, handles)
-        for axis in lowers:
-            plain_symlog(axis)
+        for k, axis in enumerate(lowers):
+            within = linear_within(view, limits[k]) if limits else 1.0
+            plain_symlog(axis, within)
             low, high = axis.get_ylim()
-            axis.set_ylim(min(-1.0, low), max(1.0, high))
+            axis.set_ylim(min(-within, low), max(within, high))
         upper.xaxis.set_major_locator(MaxNLocator(integer=True))
         # Trial 0 and the last one stand within the axes with their marks.
         upper.set_xlim(min(numbers, default=0) - 0.6, max(numbers, default=0) + 0.6)
@@ -144,6 +145,15 @@ def _limit_lines(axes: Sequence[Axes], limits: Sequence[LimitWords], handles: li
         if limit.tolerance
     ]
     handles += [*lines[:1], *allowed[:1]]
+
+
+def linear_within(view: StudyView, limit: LimitWords) -> float:
+    """Within this on either side of the limit its axis is linear: 1, or where all excesses are smaller, a power of ten below."""
+    told = [abs(_excess(limit, t)) for t in view.trials]
+    largest = max((v for v in told if np.isfinite(v)), default=0.0)
+    if largest >= 1.0 or largest == 0.0:
+        return 1.0
+    return float(10.0 ** np.ceil(np.log10(limit.tolerance or largest / 10)))
 
 
 def _excess(limit: LimitWords, trial: Trial) -> float:

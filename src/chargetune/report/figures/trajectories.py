@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.wording import objective_words
 from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
 from chargetune.report.figures.style import (
     BLUE,
     GREY,
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["LABELS", "curves", "panel_names", "trajectories_figure"]
+__all__ = ["LABELS", "curves", "episode_figure", "panel_names", "trajectories_figure"]
 
 LABELS = {
     "soc": "SOC (%)",
@@ -112,6 +114,32 @@ def trajectories_figure(view: StudyView) -> Figure:
         letter(axes[: len(names)])
         legend_above(figure, handles)
         cell_note(figure, problem.cell.name, view.remark)
+    return figure
+
+
+def episode_figure(problem: ChargingProblem, episode: Episode, score: Score | None) -> Figure:
+    """The same panels of one charge; the note below says what it was worth."""
+    with journal_style():
+        names = panel_names(problem)
+        rows = (len(names) + 1) // 2
+        figure, axes = new_figure(PAGE_IN, 2.2 * rows, rows, 2, sharex=True)
+        panels = dict(zip(names, axes, strict=False))
+        for axis in axes[len(names) :]:
+            axis.set_axis_off()
+        drawn = curves(episode)
+        for name, axis in panels.items():
+            signal = "voltage_V" if name == "near" else name
+            if signal in drawn:
+                axis.plot(*drawn[signal], color=BLUE, linewidth=0.7 if name == "near" else 1.2, label="this run", zorder=3)
+        handles = [panels["soc"].lines[-1], _limits(panels, problem)[-1]]
+        _frame(figure, panels, problem, [drawn["voltage_V"][1]])
+        letter(axes[: len(names)])
+        legend_above(figure, handles)
+        parts = [problem.cell.remark] if problem.cell.remark else []
+        if score is not None:
+            words = objective_words(problem)
+            parts.insert(0, f"{words.label}: {words.text(-score.objective)} {words.unit}".rstrip() + f", limits {'kept' if score.feasible else 'broken'}")
+        cell_note(figure, problem.cell.name, "; ".join(parts))
     return figure
 
 

@@ -46,7 +46,8 @@ def report_page(
     """
     best, start = view.tuned, view.start
     quick = evaluate and view.problem is not None and view.problem.plant is None and best is not None
-    moved = finite_differences(view, best, progress) if quick and best is not None else []
+    # On a thousand drawn plants an evaluation takes seconds: there each entry is put back, and not moved to its neighbours.
+    moved = finite_differences(view, best, progress) if quick and best is not None and not view.over_range else []
     put_back = importance(view, best, progress) if quick and best is not None else []
     promised = predicted_probabilities(view) if evaluate else []
     names = [(view.start_label, start, "untuned", "")]
@@ -98,7 +99,7 @@ def report_page(
 
 def evaluations(view: StudyView) -> int:
     """How often `report_page` calls ``progress``."""
-    return 2 * view.space.dimension + sum(p.size > 1 for p in view.space.parameters)
+    return (1 if view.over_range else 2) * view.space.dimension + sum(p.size > 1 for p in view.space.parameters)
 
 
 def _profile_legend(every: Sequence[dict[str, Any]]) -> str:
@@ -107,7 +108,8 @@ def _profile_legend(every: Sequence[dict[str, Any]]) -> str:
 
 def _importance(view: StudyView, found: Sequence[Importance]) -> dict[str, Any] | None:
     """The largest ones, in what the objective is told in: of a time the time that is lost."""
-    known = [one for one in found if one.lost is not None][:IMPORTANT]
+    scored = [one for one in found if one.lost is not None]
+    known = scored[:IMPORTANT]
     if not known:
         return None
     words = objective_of_study(view)
@@ -119,7 +121,8 @@ def _importance(view: StudyView, found: Sequence[Importance]) -> dict[str, Any] 
         "unit": unit,
         "excess": [None if one.excess is None else limit_scale * one.excess for one in known],
         "excess_unit": limit_unit,
-        "left_out": len(found) - len(known),
+        "left_out": len(scored) - len(known),
+        "unscored": [one.entry for one in found if one.lost is None],
     }
 
 

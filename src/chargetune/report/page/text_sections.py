@@ -130,6 +130,8 @@ def plant_line(problem: ChargingProblem) -> str:
 def _amount(name: str, value: float, digits: str = ".3g") -> str:
     """A difference of a limit's signal: volts in mV, the others in the unit that the limit's name ends with."""
     factor, unit = (1e3, "mV") if name.endswith("_V") else (1.0, name.rpartition("_")[2])
+    if abs(value) <= 1e-9:
+        value = 0.0  # the rounding of a held input
     return f"{factor * value:{digits}} {unit}"
 
 
@@ -146,7 +148,7 @@ def result(view: StudyView) -> str:
         span = x["upper"] - x["lower"]
         at = "at its bound" if min(value - x["lower"], x["upper"] - value) <= 1e-6 * span else ""
         rows.append((x["entry"], value, x["untuned"], x["unit"], x["lower"], x["upper"], at))
-    headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower bound", "upper bound", "")
+    headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower", "upper", "")
     scores = [t.score if t is not None else None for t in (start, best)]
     names = dict.fromkeys(name for score in scores if score is not None for name in score.metrics)
     figures: list[tuple[Cell, ...]] = []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from chargetune.battery.charging.wording import metric_words
 from chargetune.episode.episode import Episode
 from chargetune.report.best_possible import best_possible
-from chargetune.report.figures.convergence import drawn_limits, loss
+from chargetune.report.figures.convergence import drawn_limits, linear_within, loss
 from chargetune.report.study_view import StudyView
 from chargetune.report.words import limits_of_study, objective_of_study
 from chargetune.study.trial import Trial, TrialStatus
@@ -54,6 +54,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
                 "tolerance": limit.tolerance,
                 "judged": limit.judged if limit.samples > 1 else "",
                 "drawn": limit.name in drawn,
+                "within": linear_within(view, limit),
             }
             for limit in limits_of_study(view)
         ],

@@ -52,7 +52,7 @@ const Figures = (() => {
   }
 
   const heading = (text, y) => ({
-    text, xref: "paper", yref: "paper", x: 0, y, xanchor: "left", yanchor: "bottom", showarrow: false, font: { color: colour("faint") },
+    text, xref: "paper", yref: "paper", x: 0, y, xanchor: "left", yanchor: "bottom", showarrow: false, font: { color: colour("faint"), size: 12 },
   });
 
   const find = (list, key) => list.find((entry) => entry.key === key);
@@ -67,7 +67,12 @@ const Figures = (() => {
     }
     const y = axis("");
     if (panel.shown) y.range = panel.shown;
-    return plot(node, data, { xaxis: axis(panel.time, { rangemode: "tozero" }), yaxis: y, shapes: panel.limits.map(level) });
+    const [low, high] = panel.shown || [-Infinity, Infinity];
+    const there = data.some((one) => one.y.some((value) => value !== null && value >= low && value <= high));
+    const said = { text: "nothing comes near the limit", xref: "paper", yref: "paper", x: 0.5, y: 0.25, showarrow: false, font: { color: colour("faint") } };
+    return plot(node, data, {
+      xaxis: axis(panel.time, { rangemode: "tozero" }), yaxis: y, shapes: panel.limits.map(level), annotations: data.length && !there ? [said] : [],
+    });
   }
 
   function overSoc(node, key, shown, others = []) {
@@ -86,8 +91,8 @@ const Figures = (() => {
     return plot(node, data, { xaxis: axis("SOC (%)", { range: [0, 100] }), yaxis: axis("") });
   }
 
-  // Linear within 1 on either side of the limit, logarithmic beyond.
-  const squeeze = (value) => value === null || value === undefined ? null : Math.sign(value) * Math.log10(1 + Math.abs(value));
+  // Linear within so much on either side of the limit, logarithmic beyond.
+  const squeeze = (value, within) => value === null || value === undefined ? null : Math.sign(value) * Math.log10(1 + Math.abs(value) / within);
 
   // The best value up to each trial, of those that count.
   function incumbents(rows, larger = false) {
@@ -124,7 +129,7 @@ const Figures = (() => {
   function convergence(node, head, rows, marked = []) {
     const limits = head.excesses.filter(({ drawn }) => drawn), data = [], shapes = [], annotations = [];
     const count = 1 + limits.length, share = 1 / (count + 0.35), gap = 0.3 * share, layout = {};
-    const above = { low: 1 - 1.35 * share + gap, high: 1 };
+    const above = { low: 1 - 1.35 * share, high: 1 };
     const span = (k) => [(limits.length - 1 - k) * share, (limits.length - k) * share - gap];
     node.style.height = `${130 + 190 * count}px`;
     let thinned = false;
@@ -140,7 +145,7 @@ const Figures = (() => {
       limits.forEach((limit, k) => {
         const lower = extremes(all, (row) => row.excesses[limit.name]);
         data.push({
-          x: lower.map((row) => row.number), y: lower.map((row) => squeeze(row.excesses[limit.name])), name, yaxis: axisOf(k), mode: "markers", marker,
+          x: lower.map((row) => row.number), y: lower.map((row) => squeeze(row.excesses[limit.name], limit.within)), name, yaxis: axisOf(k), mode: "markers", marker,
           text: lower.map((row) => row.excesses[limit.name]?.toPrecision(4) ?? ""), showlegend: false,
           hovertemplate: `trial %{x}: %{text} ${limit.unit}<extra></extra>`,
         });
@@ -157,7 +162,7 @@ const Figures = (() => {
       x: rows.map((row) => row.number), y: incumbents(rows, head.objective.larger), name: "best so far", mode: "lines", hoverinfo: "skip",
       line: { color: colour("tuned"), width: 2, shape: "hv" },
     });
-    const values = rows.map((row) => row.value).filter((value) => value !== null), ends = [-0.03 * rows.length - 0.5, 1.03 * rows.length];
+    const values = rows.map((row) => row.value).filter((value) => value !== null), ends = [-0.02 * rows.length - 0.5, 1.02 * rows.length - 0.5];
     const line = (value, name, dash, ink) => data.push({ x: ends, y: [value, value], name, mode: "lines", hoverinfo: "name", line: { color: colour(ink), width: 1.5, dash } });
     if (head.objective.possible !== null && values.length) line(head.objective.possible, "best possible", "dot", "ink");
     if (head.objective.most && values.some((value) => value > head.objective.most * 1.000001)) line(head.objective.most, "above: not reached", "dashdot", "faint");
@@ -165,18 +170,19 @@ const Figures = (() => {
       if (!row || row.value === null) continue;
       const marker = { color: colour(ink), symbol: "circle-open", size: 15, line: { width: 2.5 } };
       data.push({ x: [row.number], y: [row.value], name: label, mode: "markers", marker, hoverinfo: "skip" });
-      limits.forEach(({ name }, k) => data.push({ x: [row.number], y: [squeeze(row.excesses[name])], yaxis: axisOf(k), mode: "markers", marker, hoverinfo: "skip", showlegend: false }));
+      limits.forEach(({ name, within }, k) => data.push({ x: [row.number], y: [squeeze(row.excesses[name], within)], yaxis: axisOf(k), mode: "markers", marker, hoverinfo: "skip", showlegend: false }));
     }
     // Without any score there is no curve below, and plotly would leave out the axis that the upper one stands on.
     if (limits.length && !values.length) data.push({ x: [0], y: [null], yaxis: axisOf(limits.length - 1), mode: "lines", showlegend: false });
-    const ticks = [-1000, -100, -10, -1, 0, 1, 10, 100, 1000];
     limits.forEach((limit, k) => {
-      const squeezed = rows.map((row) => squeeze(row.excesses[limit.name])).filter((value) => value !== null);
-      const low = Math.min(-squeeze(1), ...squeezed), high = Math.max(squeeze(1), ...squeezed), room = 0.08 * (high - low);
-      layout[`yaxis${k + 2}`] = axis("", { domain: span(k), tickvals: ticks.map(squeeze), ticktext: ticks.map(String), range: [low - room, high + room] });
+      const squeezed = rows.map((row) => squeeze(row.excesses[limit.name], limit.within)).filter((value) => value !== null);
+      const low = Math.min(-squeeze(1, 1), ...squeezed), high = Math.max(squeeze(1, 1), ...squeezed), room = 0.08 * (high - low);
+      // Over several decades the ones would stand on the zero.
+      const ticks = [-1000, -100, -10, ...(high - low < 2 ? [-1, 0, 1] : [0]), 10, 100, 1000];
+      layout[`yaxis${k + 2}`] = axis("", { domain: span(k), tickvals: ticks.map((tick) => squeeze(tick, 1)), ticktext: ticks.map((tick) => String(Number((tick * limit.within).toPrecision(1)))), range: [low - room, high + room] });
       shapes.push({ ...level(0), yref: axisOf(k) });
-      if (limit.tolerance) shapes.push({ ...level(squeeze(limit.tolerance)), yref: axisOf(k), line: { color: colour("limit"), width: 1, dash: "dot" } });
-      annotations.push(heading(`${limit.label}${unit(limit.unit)}${limit.judged ? ", " + limit.judged : ""}`, span(k)[1]));
+      if (limit.tolerance) shapes.push({ ...level(squeeze(limit.tolerance, limit.within)), yref: axisOf(k), line: { color: colour("limit"), width: 1, dash: "dot" } });
+      annotations.push(heading(`${limit.label}${unit(limit.unit)}${limit.judged && node.clientWidth > 600 ? ", " + limit.judged : ""}`, span(k)[1]));
     });
     if (limits.length) {
       data.push({ x: [null], y: [null], name: "limit", mode: "lines", line: { color: colour("limit"), width: 1.5, dash: "dash" } });
@@ -185,7 +191,7 @@ const Figures = (() => {
     // Beside the axes the titles would take what a narrow screen has of width.
     annotations.push(heading(head.objective.label + (thinned ? "; not every trial, but every extreme one" : ""), 1));
     return plot(node, data, {
-      xaxis: axis("trial", { anchor: limits.length ? axisOf(limits.length - 1) : "y", range: ends }),
+      xaxis: axis("trial", { anchor: limits.length ? axisOf(limits.length - 1) : "y", range: ends, dtick: rows.length <= 12 ? 1 : undefined }),
       // Below a decade a logarithmic axis says no more than a linear one.
       yaxis: axis("", { domain: limits.length ? [above.low, above.high] : [0, 1], type: decade(values) ? "log" : "linear", exponentformat: "power" }),
       yaxis99: { overlaying: "y", range: [0, 1], visible: false, fixedrange: true }, ...layout,

@@ -38,11 +38,14 @@
     const marked = shown.map(({ label, colour, number }) => ({ label, colour, row: rows.find((row) => row.number === number) }));
     add("convergence", "each trial, and the best so far", true, (node) => Figures.convergence(node, head, rows, marked));
     if (importance && where("importance")) {
-      const more = importance.left_out ? `; ${importance.left_out} smaller ones left out` : "";
+      const more = [
+        importance.left_out ? `; ${importance.left_out} smaller ones left out` : "",
+        importance.unscored.length ? `; without a score, since a limit ended the episode or it failed: ${importance.unscored.join(", ")}` : "",
+      ].join("");
       add("importance", `objective lost when an entry is put back${more}`, false, (node) => Figures.losses(node, importance));
     }
     if (rows.some((row) => row.status !== "running")) {
-      add("parallel", "theta of every trial (parallel coordinates)", false, (node) => Figures.parallel(node, head, rows, marked));
+      add("parallel", "theta of every trial (parallel coordinates)", true, (node) => Figures.parallel(node, head, rows, marked));
       const over = Slices(where, () => sliced());
       const node = Figures.place(where("slices"), "each trial over one entry of theta");
       const sliced = () => Figures.slice(node, head, rows, over(head, rows), marked);

@@ -112,7 +112,7 @@ async function drawOnce() {
     all.dataset.listens = "yes";
     all.on("plotly_click", ({ points }) => choose(points[0].x));
   }
-  const theta = place("parallel", "all", "theta of every trial (parallel coordinates)"), slices = place("slices", "one", "each trial over one entry of theta");
+  const theta = place("parallel", "all", "theta of every trial (parallel coordinates)", true), slices = place("slices", "one", "each trial over one entry of theta");
   await Figures.parallel(theta, head, list, marked);
   await Figures.slice(slices, head, list, sliceOver(head, list), marked);
   where("message").textContent = shown.filter(({ number, drawing: found }) => found.message && chosen.includes(number))
