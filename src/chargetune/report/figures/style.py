@@ -85,7 +85,7 @@ def new_figure(width_in: float, height_in: float, rows: int = 1, columns: int = 
 
 def letter(axes: Sequence[Axes]) -> None:
     """(a), (b), ... at the upper left, outside the data."""
-    for axis, name in zip(axes, "abcdefgh", strict=False):
+    for axis, name in zip(axes, "abcdefghijklmnopqrstuvwxyz", strict=False):
         axis.set_title(f"({name})", loc="left", pad=3)
 
 
