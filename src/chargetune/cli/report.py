@@ -16,7 +16,16 @@ from chargetune.study.files import write_whole
 __all__ = ["report_command"]
 
 
-def report_command(location: str, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, as_json: bool, certificate: Path | None = None) -> None:
+def report_command(
+    location: str,
+    *,
+    study: str | None,
+    out: Path | None,
+    figures: Path | None,
+    evaluate: bool,
+    as_json: bool,
+    certificate: Path | None = None,
+) -> None:
     """Write the page, and with ``figures`` the figures of a paper."""
     if study is None:
         names = [view.name for view in read_studies(location)]

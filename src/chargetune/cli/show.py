@@ -98,7 +98,9 @@ def _show_trials(view: StudyView) -> None:
     screen = console()
     screen.print(table)
     if limits:
-        said = (f"{limit.label} {'by trial' if limit.tolerance is None else f'{limit.tolerance:.3g} {limit.unit}'.rstrip()}" for limit in limits)
+        said = (
+            f"{limit.label} {'by trial' if limit.tolerance is None else f'{limit.tolerance:.3g} {limit.unit}'.rstrip()}" for limit in limits
+        )
         screen.print(f"[dim]an excess is kept up to its tolerance: {escape('; '.join(said))}[/]")
         means = {limit.samples for limit in limits if limit.samples > 1}
         for count in sorted(means):

@@ -52,7 +52,9 @@ def simulate_command(
         written.append(f"trace {write_whole(out, trace_csv(episode))}")
     if score is None:
         # What ended the run can still be looked at.
-        raise ValueError(f"the run has no score; it ended after {len(episode)} intervals: {ending}" + "".join(f"\n{line}" for line in written))
+        raise ValueError(
+            f"the run has no score; it ended after {len(episode)} intervals: {ending}" + "".join(f"\n{line}" for line in written)
+        )
     start, end = episode.signal("voltage_V")
     _, soc = episode.signal("soc")
     if as_json:

@@ -34,8 +34,10 @@ class _Told:
 
 @dataclass(frozen=True)
 class Promise:
-    """A trial of safe mode: the probability of keeping every limit that the twin of the trials before it says, None for a start
-    that was declared; what the trial spent, and all up to it, mV s.
+    """A trial of safe mode and what was predicted of it.
+
+    ``probability`` of keeping every limit is that of the twin of the trials before it, None for a start that was declared.
+    ``spent`` is what the trial was beyond the limit, ``total`` that of all up to it, mV s.
     """
 
     trial: Trial

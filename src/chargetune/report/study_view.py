@@ -93,7 +93,8 @@ class StudyView:
     @cached_property
     def units(self) -> dict[str, str]:
         """Unit of every signal in the first trace that can be read, by name; empty without one."""
-        for reading in self.readings(t for t in self.trials if t.trace_sha256 is not None):
+        traced = [t for t in self.trials if t.trace_sha256 is not None]
+        for reading in self.readings(traced) if traced else ():
             episode = reading.episode
             if episode is not None:
                 names = (*episode.input_names, *episode.output_names)

@@ -69,7 +69,9 @@ def certificate_figure(path: str | os.PathLike[str]) -> Figure:
             if not np.isfinite(times).any():
                 # A SOC that no episode reached has no curve, and so no place in the legend.
                 continue
-            handles += lower[0].plot(share, np.sort(np.where(np.isfinite(times), times, np.nan)), color=color, linewidth=1.8, label=_named(mark))
+            handles += lower[0].plot(
+                share, np.sort(np.where(np.isfinite(times), times, np.nan)), color=color, linewidth=1.8, label=_named(mark)
+            )
             for axis, (name, drawn) in zip(lower[1:], conditions.items(), strict=True):
                 _points(axis, CONDITIONS[name][1] * drawn, times, broken, color)
         if conditions and np.any(broken):

@@ -48,7 +48,11 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
                 continue
             drawn = curves(row.episode)
             own = row.name in COLOURS
-            style: dict[str, Any] = {"color": COLOURS[row.name], "linewidth": 2.6 if row.name == "plant oracle" else 1.3} if own else {"color": GREY, "linewidth": 0.8}
+            style: dict[str, Any] = (
+                {"color": COLOURS[row.name], "linewidth": 2.6 if row.name == "plant oracle" else 1.3}
+                if own
+                else {"color": GREY, "linewidth": 0.8}
+            )
             if not own:
                 style["linestyle"] = next(dashes, "-")
             label = f"{row.name}{' (breaks a limit)' if row.breaks_limit else ''}"

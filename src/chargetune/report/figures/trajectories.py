@@ -138,7 +138,11 @@ def episode_figure(problem: ChargingProblem, episode: Episode, score: Score | No
         parts = [problem.cell.remark] if problem.cell.remark else []
         if score is not None:
             words = objective_words(problem)
-            parts.insert(0, f"{words.label}: {words.text(-score.objective)} {words.unit}".rstrip() + f", limits {'kept' if score.feasible else 'broken'}")
+            parts.insert(
+                0,
+                f"{words.label}: {words.text(-score.objective)} {words.unit}".rstrip()
+                + f", limits {'kept' if score.feasible else 'broken'}",
+            )
         cell_note(figure, problem.cell.name, "; ".join(parts))
     return figure
 

@@ -33,7 +33,9 @@ def theta_figures(view: StudyView, found: Sequence[Importance]) -> str:
     """Importance of the entries of theta, all trials as parallel coordinates, and slices."""
     parts = []
     if found and view.start_label == "untuned":
-        said = "Objective lost when one entry of theta, or a whole parameter, is put back to its untuned value; the others stay as they are."
+        said = (
+            "Objective lost when one entry of theta, or a whole parameter, is put back to its untuned value; the others stay as they are."
+        )
         parts.append(paragraph(said + " Where it is negative, the untuned value has the better objective, and is often over a limit."))
         parts.append('<div class="figures" id="importance"></div>\n')
     elif found:
@@ -84,7 +86,9 @@ def certificate(view: StudyView, stated: dict[str, Any] | None) -> str:
     if view.problem is None:
         return ""
     if stated is None:
-        said = "No certificate of this study was found beside its store. `chargetune certify STORE` makes one: the tuned controller on fresh"
+        said = (
+            "No certificate of this study was found beside its store. `chargetune certify STORE` makes one: the tuned controller on fresh"
+        )
         return section("Certificate", paragraph(f"{said} episodes of its range of use, and a bound on the probability of a violation."))
     found, trial = stated["figures"], stated["origin"]["trial"]
     bound = f"{100 * found['violation_probability_upper']:.2f} % (confidence {100 * stated['confidence']:g} %)"

@@ -61,10 +61,15 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "metrics": {name: list(metric_words(name)) for name in names},
         "limits": limits_of(view),
         "theta": [
-            {"entry": entry, "unit": "" if u == "1" else u, "lower": float(low), "upper": float(high), "untuned": float(start), "scale": scale}
-            for entry, u, low, high, start, scale in zip(
-                space.entries, units, space.lower, space.upper, space.default, scales, strict=True
-            )
+            {
+                "entry": entry,
+                "unit": "" if u == "1" else u,
+                "lower": float(low),
+                "upper": float(high),
+                "untuned": float(start),
+                "scale": scale,
+            }
+            for entry, u, low, high, start, scale in zip(space.entries, units, space.lower, space.upper, space.default, scales, strict=True)
         ],
     }
 
