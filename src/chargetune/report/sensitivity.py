@@ -62,9 +62,11 @@ def importance(view: StudyView, trial: Trial, progress: Callable[[], None] = lam
         back = theta.copy()
         back[part] = space.default[part]
         score = evaluate(back, trial.seed)[0] if not np.array_equal(back, theta) else base
-        known = score is not None and base is not None
-        lost = base.objective - score.objective if known else None
-        out.append(Importance(name, lost, worst_excess(view, score) - worst_excess(view, base) if known else None))
+        if score is None or base is None:
+            out.append(Importance(name, None, None))
+        else:
+            excess = worst_excess(view, score) - worst_excess(view, base)
+            out.append(Importance(name, base.objective - score.objective, excess))
         progress()
     return sorted(out, key=lambda one: -abs(one.lost or 0.0))
 

@@ -66,7 +66,10 @@ class LimitWords:
 
 @dataclass(frozen=True)
 class ObjectiveWords:
-    """How the loss of a study is told: ``factor`` times it is in ``unit``; below 0, what is told is to be large. A loss beyond ``most`` (in it) is no time: it was not reached."""
+    """How the loss of a study is told: ``factor`` times it is in ``unit``; below 0, what is told is to be large.
+
+    What is told and beyond ``most`` is no time: it was not reached.
+    """
 
     label: str
     short: str
@@ -97,10 +100,7 @@ def limit_words(problem: ChargingProblem, limit: Limit) -> LimitWords:
     factor, unit = (1e3, "mV") if limit.unit == "V" else (1.0, limit.unit)
     samples, tolerance = judgement(problem, limit)
     side, name = "over" if limit.upper else "under", limit.name
-    if name == "voltage_max_V":
-        largest = "overshoot_mV"
-    else:
-        largest = "" if limit.of == "voltage" else f"{name.rpartition('_')[0]}_excess_{unit}"
+    largest = {"voltage_max_V": "overshoot_mV", "voltage_min_V": ""}.get(name, f"{name.rpartition('_')[0]}_excess_{unit}")
     what = WHAT[limit.of]
     label = f"{what} {side} {limit.bound:g} {limit.unit}"
     return LimitWords(name, label, f"{what.partition(' ')[0]}\n{side}\n({unit})", unit, factor, factor * tolerance, samples, largest)

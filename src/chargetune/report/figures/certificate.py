@@ -59,7 +59,7 @@ def certificate_figure(path: str | os.PathLike[str]) -> Figure:
             upper, what = row_of[_unit(limit["name"])[1]], limit["name"].rpartition("_")[0].replace("_", " ")
             handles += upper[0].plot(share, np.sort(values), color=color, label=what)
             # As many tolerances as there are limits, each in the colour of its own; equal ones show between each other's dashes.
-            dashes = {"color": color, "linestyle": (4 * k, (4, 4)), "linewidth": 0.9, "label": f"its tolerance ({what})"}
+            dashes: dict[str, Any] = {"color": color, "linestyle": (4 * k, (4, 4)), "linewidth": 0.9, "label": f"its tolerance ({what})"}
             line = [axis.axhline(bound, **dashes) for axis in upper]
             handles.append(line[0])
             for axis, (name, drawn) in zip(upper[1:], conditions.items(), strict=True):

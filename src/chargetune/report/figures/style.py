@@ -90,7 +90,7 @@ def letter(axes: Sequence[Axes]) -> None:
 
 
 def plain_symlog(axis: Axes, within: float = 1.0) -> None:
-    """A y axis for an excess: linear ``within`` so much on either side of the limit, logarithmic beyond, with plain numbers at its ticks."""
+    """A y axis for an excess: linear ``within`` so much on either side of the limit, logarithmic beyond, with plain numbers."""
     from matplotlib.ticker import StrMethodFormatter
 
     axis.set_yscale("symlog", linthresh=within, linscale=0.5)

@@ -107,8 +107,8 @@ def what_was_tuned(view: StudyView) -> str:
         parts.append(
             paragraph("The study is not one of battery charging. What an evaluation does is in its configuration, under Provenance.")
         )
-        rows = [(x["label"], _told(x["tolerance"], x["unit"])) for x in head["excesses"]]
-        parts += [table(("limit", "tolerance"), rows)] if rows else []
+        allowed = [(x["label"], _told(x["tolerance"], x["unit"])) for x in head["excesses"]]
+        parts += [table(("limit", "tolerance"), allowed)] if allowed else []
     return section("What was tuned", *parts)
 
 
@@ -190,7 +190,8 @@ def limits(view: StudyView) -> str:
 
 
 def _stored(view: StudyView) -> list[tuple[Cell, ...]]:
-    score, out = None if view.tuned is None else view.tuned.score, []
+    score = None if view.tuned is None else view.tuned.score
+    out: list[tuple[Cell, ...]] = []
     for limit in limits_of_study(view) if score is not None else []:
         excess = f"{limit.factor * score.excess[limit.name]:.4g} {limit.unit}".rstrip() if score and limit.name in score.excess else None
         out.append((limit.label, excess, _told(limit.tolerance, limit.unit)))
