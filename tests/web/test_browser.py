@@ -153,3 +153,17 @@ def test_no_button_sends_a_figure_anywhere(open_page, address, store, tmp_path, 
     sends = page.evaluate("() => [...document.querySelectorAll('.plot')].map((plot) => plot._context.plotlyServerURL)")
     assert set(sends) == {""}
     assert page.wrong == []
+
+
+def test_a_filter_shows_some_trials_and_theta_can_stand_in_the_table(open_page, address, store):
+    page, view = open_page(f"{address}/studies/1", wait="#rows tr"), read_study(store, "charge")
+    assert page.locator("th[data-key^='theta ']").count() == 0
+    page.locator("#with-theta").check()
+    assert page.locator("th[data-key^='theta ']").count() == view.space.dimension
+    entry, bound = view.space.entries[0], float(np.median([t.theta[0] for t in view.trials]))
+    page.locator("#filter").fill(f"{entry} > {bound}")
+    assert sorted(map(int, column(page, 1))) == [t.number for t in view.trials if t.theta[0] > bound]
+    page.locator("#filter").fill("")
+    page.locator("#kind").select_option("failed")
+    assert sorted(map(int, column(page, 1))) == [3, 6]
+    assert page.wrong == []
