@@ -30,6 +30,7 @@ METRIC_WORDS = {
     "anode_min_excess_mVs": ("anode potential under its limit, integral", "mV s"),
     "solver_failures": ("control steps not solved to tolerance", ""),
     "unsolved_percent": ("control steps not solved to tolerance", "%"),
+    "objective_worst": ("objective on the worst drawn plant", ""),
     "plants": ("drawn plants", ""),
     "violating_plants": ("drawn plants over a limit", ""),
 }
