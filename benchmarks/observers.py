@@ -20,7 +20,6 @@ from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.settings import ControllerSettings, EpisodeSettings, EstimatorSettings, SensorSettings
 
-SEEDS = range(20)
 HOUR_S = 3600.0
 ESTIMATORS = {
     "open_loop": [("open_loop", EstimatorSettings(kind="open_loop"))],
@@ -30,6 +29,14 @@ ESTIMATORS = {
     ],
     "adaptive": [(f"adaptive, backoff_sd {k:g}", EstimatorSettings(kind="adaptive", adaptive=Adaptive(backoff_sd=k))) for k in (0.0, 3.0)],
 }
+
+
+def span(text):
+    """The range of a text such as 0:20."""
+    first, stop = (int(part) for part in text.split(":"))
+    if not 0 <= first < stop:
+        raise ValueError(text)
+    return range(first, stop)
 
 
 def problem(estimator, seed, step_s, noise_V):
@@ -83,12 +90,15 @@ def main():
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print JSON for a program")
+    parser.add_argument(
+        "--seeds", type=span, default=range(20), metavar="FIRST:STOP", help="seeds of the wrong models, 0:20 where not given"
+    )
     parser.add_argument("--kinds", nargs="*", default=list(ESTIMATORS), choices=list(ESTIMATORS))
     parser.add_argument("--steps-s", nargs="*", type=float, default=[1.0, 10.0])
     parser.add_argument("--noise-V", nargs="*", type=float, default=[0.0, 0.002])
     arguments = parser.parse_args()
     rows = [
-        row(label, estimator, step_s, noise_V, SEEDS)
+        row(label, estimator, step_s, noise_V, arguments.seeds)
         for step_s in arguments.steps_s
         for noise_V in arguments.noise_V
         for kind in arguments.kinds

@@ -1,5 +1,6 @@
 """Steps that are not solved and costs that are not convex are told; and a controller with given signals is checked under them."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -102,3 +103,16 @@ def test_a_cost_that_is_bent_downwards_is_told_by_name(heating):
     assert (found.code, found.severity) == ("non-convex", "warning")
     assert "stage_cost has curvature -2 along T" in found.message
     assert found.numbers["curvature_least"] == pytest.approx(-2.0)
+
+
+def test_a_limit_that_is_no_number_is_not_kept(heating):
+    """Its bound is a root of what becomes negative after half of the episode."""
+    controller = heating(limits=[SoftLimit("T", lower=lambda s: ca.sqrt(s.given["least"]), at="end", penalty=50.0, scale=0.1)])
+    falling = TOLD | {"least": np.linspace(1.0, -1.0, STEPS)}
+    # Along a run without this limit: with it no step is solved.
+    run = simulate(heating(), perfect_plant(heating()), steps=STEPS, given=TOLD)
+    found = check_limits(controller, run, given=falling)
+    assert [f.code for f in found] == ["limit-not-kept"]
+    assert "is no number in" in found[0].message
+    (first, *_) = check_formulation(controller, steps=STEPS, given=TOLD | {"least": -1.0})
+    assert (first.code, "no finite number at the start" in first.message) == ("unsafe-start", True)

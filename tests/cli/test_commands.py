@@ -86,8 +86,8 @@ def test_a_bad_theta_is_refused(theta, words, tmp_path, refused):
     [
         (("[controller]", "[controler]"), ["controler is not a known key"]),
         (("steps = 60", "stepps = 60"), ["episode.stepps is not a known key"]),
-        (("steps = 60", "steps = true"), ["episode.steps = True", "integer"]),
-        (("steps = 60", 'steps = "60"'), ["episode.steps = '60'", "integer"]),
+        (("steps = 60", "steps = true"), ["episode.steps = true", "a whole number"]),
+        (("steps = 60", 'steps = "60"'), ["episode.steps = '60'", "a whole number"]),
         (("steps = 60", "steps = 0"), ["steps = 0", "[1, 1000000]"]),
         (("trials = 6", "trials = 0"), ["study.trials = 0", "1"]),
         (("nodes = 3", "nodes = 1"), ["nodes = 1", "[2, 50]"]),

@@ -22,9 +22,14 @@ def test_it_writes_a_study_that_reads_the_voltage_and_has_a_range(tmp_path):
 def test_it_overwrites_nothing(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("mine")
-    out = chargetune("init", path, code=2)
-    assert "exists, allowed is the name of a new file" in out.stderr
+    for more in ([], ["--overwrite"]):
+        out = chargetune("init", path, *more, code=2)
+        assert "there is a text file of this name" in out.stderr
     assert path.read_text() == "mine"
+    path.write_text("[study]\nseed = 1\n")
+    assert "exists; --overwrite replaces it" in chargetune("init", path, code=2).stderr
+    chargetune("init", path, "--overwrite")
+    assert "[range]" in path.read_text()
 
 
 def test_the_cell_file_is_found_from_where_the_study_lies(tmp_path):
@@ -35,3 +40,13 @@ def test_the_cell_file_is_found_from_where_the_study_lies(tmp_path):
     config = load_config(folder / "mine.toml")
     assert config.cell.file == "../cell.toml"
     assert config.problem(folder).controller.current_ramp_A_s > 0
+
+
+def test_the_ramp_that_it_tells_of_is_one_that_can_be_tuned(tmp_path):
+    path = tmp_path / "mine.toml"
+    chargetune("init", path)
+    text = path.read_text()
+    for line in ("[theta.current_ramp]", "lower_A_s", "upper_A_s"):
+        text = text.replace(f"# {line}", line)
+    path.write_text(text)
+    assert "current_ramp_A_s" in load_config(path).problem(tmp_path).space.entries

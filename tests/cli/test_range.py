@@ -107,7 +107,7 @@ def test_the_certificate_is_of_the_range_that_theta_was_tuned_for(folder):
     ("tables", "words"),
     [
         ({}, "tuner = 'range' is given without a table [range]"),
-        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with [plant]"),
+        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with an electrochemical [plant]"),
     ],
 )
 def test_a_range_that_cannot_be_tuned_is_refused(tables, words, tmp_path, refused):
@@ -120,7 +120,8 @@ def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
     done = chargetune("compare", folder / "use.toml", "--store", folder / "use.sqlite", "--draws", 4, "--workers", 1, "--json")
     told = json.loads(done.stdout)
     rows = {row["name"]: row for row in told["rows"]}
-    assert list(rows) == ["CC-CV", "nominal MPC", "best constant backoff", "tuned", "MPC that knows each plant", "plant oracle"]
+    wanted = ["CC-CV that keeps all limits", "nominal MPC", "best constant backoff", "tuned", "MPC that knows each plant", "plant oracle"]
+    assert list(rows) == wanted
     assert {row["draws"] for row in rows.values()} == {told["draws"]} == {4}
     assert (rows["plant oracle"]["violations"], rows["plant oracle"]["ratio"]) == (0, 1.0)
     assert told["range"]["soc_start"] == [0.3, 0.5]

@@ -35,7 +35,7 @@ def test_identify_writes_a_cell_that_a_study_takes(shared, tmp_path):
     (tmp_path / "study.toml").write_text('[cell]\nfile = "leaf.toml"\n[limits]\ncurrent_max_A = 20.0\n[episode]\nsteps = 20\n')
     out = json.loads(chargetune("simulate", tmp_path / "study.toml", "--json").stdout)
     assert out["soc"][-1] > 0.05
-    text = chargetune("identify", pulses, "-o", cell).stdout
+    text = chargetune("identify", pulses, "-o", cell, "--overwrite").stdout
     assert "R0 mΩ" in text
     assert "capacity 30.5" in text
 

@@ -43,6 +43,7 @@ def test_the_command_stops_and_resumes(tmp_path, number):
         # Whatever went wrong, it does not go on beside the tests that follow.
         process.kill()
     assert process.returncode == 130
+    assert "trials that are told are kept; a second Ctrl-C ends at once" in err
     assert "interrupted; the same command resumes" in err
     with Store(tmp_path / "s.db") as store:
         trials = store.trials(1)
@@ -50,6 +51,57 @@ def test_the_command_stops_and_resumes(tmp_path, number):
     again = chargetune(*command[3:], "--trials", len(trials) + 1, "--json")
     found = json.loads(again.stdout)
     assert (found["trials"], found["failed"]) == (len(trials) + 1, 0)
+
+
+def test_a_campaign_with_workers_stops_in_the_midst_of_its_turns_and_resumes(tmp_path):
+    (tmp_path / "s.toml").write_text(CONFIG)
+    (tmp_path / "c.toml").write_text('[campaign]\nconfigs = ["s.toml"]\nseeds = "0:4"\ntrials = 100000\n')
+    command = [sys.executable, "-m", "chargetune", "campaign", "c.toml", "--workers", "2", "--store", "s.db", "--json"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        until = time.monotonic() + 120
+        while told(tmp_path / "s.db") < 3:
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "interrupted; the same command resumes" in err
+    assert "Traceback" not in err
+    with Store(tmp_path / "s.db") as store:
+        trials = [t for record in store.studies() for t in store.trials(record.id)]
+    # Nothing that was told is lost, and nothing counts as failed.
+    assert {t.status for t in trials} <= {"done", "running"}
+    assert {t.losses for t in trials} == {0}
+
+
+def catches(process, number):
+    """Whether a process has a handler for a signal."""
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
+    return bool(int(status["SigCgt"], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell which signals a process handles")
+def test_a_command_that_keeps_nothing_does_not_say_that_it_resumes(tmp_path):
+    (tmp_path / "s.toml").write_text(CONFIG)
+    command = [sys.executable, "-m", "chargetune", "check", "s.toml"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        until = time.monotonic() + 60
+        while not catches(process.pid, signal.SIGTERM):
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "what runs is given up; a second Ctrl-C ends at once" in err
+    assert "resumes" not in err
 
 
 def test_an_episode_step_by_step_that_is_interrupted_is_no_failed_trial(tmp_path):

@@ -227,6 +227,23 @@ def test_the_trace_of_a_filter_is_what_it_did():
     assert np.all(trace.sd > 0)
 
 
+def test_the_trace_of_a_filter_under_given_signals_and_an_input_before():
+    """A gain that a given signal moves in time; at rest the plant had an input."""
+    model = settable(noise=0.1, drift=0.05, first=0.3, gate=50.0)
+    own = Controller.build(
+        model, ParameterSpace(()), horizon=4, stage_cost=lambda s: (s.x["a"] - 1.0) ** 2 + 0.1 * s.u["u"] ** 2,
+        input_lower={"u": -1.0}, input_upper={"u": 1.0}, parameters=lambda s: {"drift": s.given["wind"], "noise": 2.0 * s.given["wind"]},
+        given=(Signal("wind"),), estimator=NAMED, input_before={"u": 0.4},
+    )  # fmt: skip
+    wind = {"wind": 0.05 + 0.04 * np.sin(np.arange(30.0))}
+    plant = SimulatedPlant(model, {"a": 0.3}, Sensors({"y": 0.1}), {"b": 0.05}, input_before={"u": 0.4})
+    episode = run_episode(own, plant, steps=30, seed=2, given=wind)
+    np.testing.assert_allclose(filter_trace(own, episode, given=wind).estimate, episode.estimate, atol=1e-9)
+    assert np.max(np.abs(filter_trace(own, episode, given={"wind": 0.05}).estimate - episode.estimate)) > 1e-4
+    with pytest.raises(ValueError, match="given: missing"):
+        filter_trace(own, episode)
+
+
 def test_nine_of_ten_intervals_hold_the_true_state():
     """On plants that the model matches, linear and bent, with the filter's own noise."""
     held = []

@@ -7,7 +7,8 @@ from multiprocessing import get_context
 import pytest
 from study_toy import Deadly, OnlyHere, Toy, essence, open_study
 
-from chargetune.study.executors import process_executor
+from chargetune.study import executors
+from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.store.store import Store
 from chargetune.study.study import StudyError, WorkerError
 
@@ -133,3 +134,67 @@ def test_workers_have_one_thread_ignore_ctrl_c_and_this_process_keeps_its_own_se
 def test_bad_workers(workers):
     with pytest.raises(ValueError, match=f"workers = {workers}, allowed is an integer >= 1"):
         process_executor(workers)
+
+
+def begin_and_wait(folder, number):
+    (folder / str(number)).write_text(str(os.getpid()))
+    try:
+        time.sleep(600)
+    finally:
+        (folder / f"{number} left").touch()
+
+
+def test_an_interrupt_waits_for_no_evaluation_and_cancels_what_is_queued(tmp_path):
+    calls = []
+
+    def interrupted():
+        with process_executor(2) as pool:
+            calls.extend(pool.submit(begin_and_wait, tmp_path, number) for number in range(6))
+            while len(list(tmp_path.iterdir())) < 2:
+                time.sleep(0.02)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [call.cancelled() for call in calls[2:]] == [True] * 4
+    # What ran left its evaluation in order, and is no more.
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0", "0 left", "1", "1 left"]
+    until = time.monotonic() + 60
+    for number in (0, 1):
+        while gone(int((tmp_path / str(number)).read_text())) is False:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+
+def gone(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize(
+    ("wanted", "work", "count", "said"),
+    [
+        (1, None, 1, ""),
+        (4, None, 4, ""),
+        (4, 9, 4, ""),
+        (4, 3, 3, "workers = 4 lowered to 3: 3 trials to run"),
+        (4, 1, 1, "workers = 4 lowered to 1: 1 trial to run"),
+        (1000, None, 4, "workers = 1000 lowered to 4: this machine has 4 cores"),
+        (1000, 3, 3, "workers = 1000 lowered to 3: 3 trials to run"),
+        (2, 0, 1, "workers = 2 lowered to 1: 0 trials to run"),
+    ],
+)
+def test_workers_are_not_more_than_cores_and_trials(monkeypatch, wanted, work, count, said):
+    monkeypatch.setattr(executors, "_cores", lambda: 4)
+    assert bounded_workers(wanted, work) == (count, said)
+
+
+def test_a_study_and_an_executor_of_its_own_say_that_workers_are_lowered(store, monkeypatch):
+    monkeypatch.setattr(executors, "_cores", lambda: 1)
+    with pytest.warns(RuntimeWarning, match="workers = 24 lowered to 1: this machine has 1 core"), process_executor(24):
+        pass
+    with open_study(store) as study, pytest.warns(RuntimeWarning, match="workers = 24 lowered to 1"):
+        study.run(Toy(), 2, workers=24)

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.checks.estimator import check_detectability
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_influence
 from chargetune.checks.solves import check_costs, check_solves
@@ -61,13 +62,14 @@ def check_formulation(
     finer: Model | None = None,
     quick: bool = False,
     given: Given | None = None,
+    along: str | None = None,
 ) -> tuple[Finding, ...]:
     """All checks of a controller that need no verdict on an episode; an unsafe start is told alone.
 
     ``plant`` is what the influence of theta is looked for on, by default a perfect model of the untuned controller.
     ``signs``: see `check_signs`; ``finer`` is the model with a shorter sampling time, for limits between samples.
     ``quick`` leaves out what builds other solvers when nothing is suspicious: longer horizons. ``given``: the given signals of
-    the controller and the plants.
+    the controller and the plants. ``along``: a state that tells the place in an episode, beside the time.
     """
     names = tuple(dict.fromkeys((*controller.given_names, *(plant.given if plant else ()))))
     # What is checked is the formulation: with forecasts that are right.
@@ -83,6 +85,7 @@ def check_formulation(
     found += check_costs(controller)
     if run.state is not None and len(run):
         found += check_solves(run)
+        found += check_detectability(controller, run, _signals(controller, given, len(run))[0], along)
         found += check_signs(controller, signs or {}, run.state, run.input, given=first)
         found += check_horizon(controller, run.state, run.input, given=first)
         found += check_limits(controller, run, finer=finer, given=own)
@@ -113,6 +116,9 @@ def check_limits(
             # A state at the start of an interval is the same as at the end of the one before.
             ends["start"] = ends["end"]
         seen = np.max([ends[name] for name in ("start", "end") if limit.at in (name, "both")], axis=0)
+        if np.isnan(seen).any():
+            out.append(_not_known(limit, run, seen))
+            continue
         inside = np.maximum(ends["start"], ends["end"]) + _hump(controller, j, finer, run, theta, given)
         if np.max(seen) > noticeable(limit):
             out += _broken_where_seen(controller, j, run, seen, theta, given)
@@ -223,6 +229,19 @@ def _signals(controller: Controller, given: Given | None, count: int) -> tuple[N
     seen = windows([values[name] for name in controller.given_names], count, controller.horizon)
     _, now, then, *_ = np.moveaxis(seen.reshape(count, controller.horizon + 2, -1), 1, 0)
     return now, then
+
+
+def _not_known(limit: LimitRows, run: Episode, seen: NDArray[np.float64]) -> Finding:
+    lost = np.isnan(seen)
+    return Finding(
+        "limit-not-kept",
+        "warning",
+        f"{limit.of} or its bound is no number in {np.sum(lost)} of {len(run)} intervals of a perfect model, first after "
+        f"{run.time_s[np.argmax(lost)] / 60:.3g} min: a limit that is not known is not kept",
+        f"an expression of {limit.of} and of its bound that is defined wherever the model goes",
+        {"intervals": float(np.sum(lost)), "first_min": float(run.time_s[np.argmax(lost)] / 60)},
+        Evidence("time (min)", f"{limit.of} beyond its limit", {"closed loop": (run.time_s / 60, seen)}, {"limit": 0.0}),
+    )
 
 
 def _between(limit: LimitRows, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float) -> Finding:

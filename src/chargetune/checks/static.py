@@ -127,13 +127,15 @@ def check_start(controller: Controller, theta: ArrayLike | None = None, given: N
             continue
         # A state's row at the start is given, whatever `at` says; an output's depends on the input.
         excess = row_values(controller, j, np.tile(start, (len(choices), 1)), choices, values, given=np.tile(signals, (len(choices), 1)))
-        least = float(np.min(excess))
+        # An input that gives no number keeps no limit.
+        least = float(np.min(np.where(np.isnan(excess), np.inf, excess)))
         if least > noticeable(limit):
+            beyond = f"beyond its limit by {least:.4g}" if np.isfinite(least) else "no finite number"
             out.append(
                 Finding(
                     "unsafe-start",
                     "error",
-                    f"{limit.of} is beyond its limit by {least:.4g} at the start, whatever the input",
+                    f"{limit.of} is {beyond} at the start, whatever the input",
                     f"start elsewhere, move the limit of {limit.of}, or allow an input that keeps it",
                     {"least_excess": least},
                     Evidence("input tried", f"{limit.of} beyond its limit", {"start": (choices[:, 0], excess)}, {"limit": 0.0}),

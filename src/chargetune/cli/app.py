@@ -11,7 +11,8 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
-from chargetune.runtime.interrupts import handled_interrupts
+from chargetune.cli.terminal import any_terminal
+from chargetune.runtime.interrupts import INTERRUPTED, Watch, handled_interrupts
 
 __all__ = ["app", "main"]
 
@@ -23,9 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-store_app = typer.Typer(name="store", help="Check, salvage, export or convert a store.", no_args_is_help=True, rich_markup_mode=None)
+store_app = typer.Typer(name="store", help="Check, salvage, export or migrate a store.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(store_app)
-INTERRUPTED = 130
 # EX_SOFTWARE of sysexits.h.
 DEFECT = 70
 
@@ -59,6 +59,7 @@ class TunerChoice(StrEnum):
 ConfigFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 StoreArgument = Annotated[str, typer.Argument(help="Store: a file, or postgresql://user@host/database.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program instead of text for a person.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of the same kind that exist.")]
 Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 
 
@@ -66,11 +67,12 @@ Workers = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 def init(
     path: Annotated[Path, typer.Argument(help="Study file to write.")] = Path("study.toml"),
     cell: Annotated[Path | None, typer.Option(help="Cell file, as `identify` writes it.")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a commented study file that runs."""
     from chargetune.cli.init import init_command
 
-    init_command(path, cell=cell)
+    init_command(path, cell=cell, overwrite=overwrite)
 
 
 @app.command()
@@ -85,9 +87,11 @@ def tune(
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     accept_changed: Annotated[bool, typer.Option("--accept-changed", help="Resume although the study file has changed.")] = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Tune theta on the plant of a study file. The same command again resumes."""
+    _read_first(config, "study")
     from chargetune.cli.tune import tune_command
 
     tune_command(
@@ -99,6 +103,7 @@ def tune(
         out=out,
         force=force,
         accept_changed=accept_changed,
+        overwrite=overwrite,
         as_json=as_json,
     )
 
@@ -114,6 +119,7 @@ def campaign(
     as_json: AsJson = False,
 ) -> None:
     """Tune many study files with many seeds. The same command again resumes."""
+    _read_first(file, "campaign")
     from chargetune.cli.campaign import campaign_command
 
     campaign_command(file, store=store, workers=workers, force=force, as_json=as_json)
@@ -124,12 +130,14 @@ def check(
     config: ConfigFile,
     safe: Annotated[str | None, typer.Option(help="A theta declared safe, as for simulate --theta; it has to keep every limit.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for a figure of each finding.")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Find errors of a formulation before anything is tuned; exit code 1 when there are any."""
+    _read_first(config, "study")
     from chargetune.cli.check import check_command
 
-    check_command(config, safe=safe, figures=figures, as_json=as_json)
+    check_command(config, safe=safe, figures=figures, overwrite=overwrite, as_json=as_json)
 
 
 @app.command()
@@ -141,12 +149,14 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbances.")] = 0,
     figure: Annotated[Path | None, typer.Option(help="Figure of the run to write (png, pdf, svg).")] = None,
     out: Annotated[Path | None, typer.Option(help="Trace of the run to write (CSV), one row an interval.")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Run one closed loop of a study file at one theta."""
+    _read_first(config, "study")
     from chargetune.cli.simulate import simulate_command
 
-    simulate_command(config, theta=theta, seed=seed, figure=figure, out=out, as_json=as_json)
+    simulate_command(config, theta=theta, seed=seed, figure=figure, out=out, overwrite=overwrite, as_json=as_json)
 
 
 @app.command()
@@ -173,12 +183,15 @@ def report(
     certificate: Annotated[
         Path | None, typer.Option(help="Certificate of the study; by default the one beside the store, where it is of this study.")
     ] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write one study as a self-contained HTML page, which opens offline."""
     from chargetune.cli.report import report_command
 
-    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, certificate=certificate, as_json=as_json)
+    report_command(
+        store, study=study, out=out, figures=figures, evaluate=evaluate, certificate=certificate, overwrite=overwrite, as_json=as_json
+    )
 
 
 @app.command()
@@ -206,12 +219,15 @@ def reproduce(
     out: Annotated[Path, typer.Option(help="Folder for stores, claims.json and figures; studies found there go on.")] = Path(
         "out/reproduce"
     ),
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Repeat a study of Hirt et al. (ADCHEM 2024) over mismatch seeds and decide its claims."""
     from chargetune.cli.reproduce import reproduce_command
 
-    reproduce_command(case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, as_json=as_json)
+    reproduce_command(
+        case.value, seeds=seeds, trials=trials, tuner=tuner.value, workers=workers, out=out, overwrite=overwrite, as_json=as_json
+    )
 
 
 @app.command()
@@ -220,20 +236,37 @@ def identify(
     out: Annotated[Path, typer.Option("--output", "-o", help="Cell file to write.")] = Path("cell.toml"),
     rc: Annotated[int, typer.Option(min=1, max=2, help="R-C pairs of the circuit.")] = 1,
     capacity: Annotated[
-        float | None, typer.Option("--capacity-Ah", help="Capacity; by default the charge between the record's fullest and emptiest point.")
+        float | None,
+        typer.Option("--capacity-Ah", help="Capacity of one cell; by default the charge between the record's fullest and emptiest point."),
     ] = None,
     ocv: Annotated[
         Path | None, typer.Option(help="A slow charge and discharge (CSV) to take the OCV from; surer near full and empty.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the cell; the file's by default.")] = None,
+    series: Annotated[int, typer.Option(min=1, help="Cells in series, where the files are of a pack; the cell file is of one cell.")] = 1,
+    parallel: Annotated[int, typer.Option(min=1, help="Cells in parallel, where the files are of a pack.")] = 1,
     figure: Annotated[Path | None, typer.Option(help="Figure of the fit to write (png, pdf, svg).")] = None,
     check: Annotated[list[Path] | None, typer.Option(help="A discharge (CSV) to predict with the cell; may be given again.")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit a cell's circuit to measured pulses: OCV, R0 and R-C pairs over SOC."""
     from chargetune.cli.identify import identify_command
 
-    identify_command(data, out=out, rc=rc, capacity_Ah=capacity, ocv=ocv, name=name, figure=figure, check=check or [], as_json=as_json)
+    identify_command(
+        data,
+        out=out,
+        rc=rc,
+        capacity_Ah=capacity,
+        ocv=ocv,
+        name=name,
+        figure=figure,
+        check=check or [],
+        series=series,
+        parallel=parallel,
+        overwrite=overwrite,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -241,6 +274,7 @@ def compare(
     config: ConfigFile,
     store: Annotated[str | None, typer.Option(help="Store with the study whose tuned controller is compared.")] = None,
     study: Annotated[str | None, typer.Option(help="Name of that study; the config's by default.")] = None,
+    row: Annotated[list[str] | None, typer.Option(help="Only this row of the table; repeat it for several.", show_default=False)] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draws, and of the noise that the controllers see.")] = 0,
     draws: Annotated[
         int | None,
@@ -248,15 +282,28 @@ def compare(
     ] = None,
     workers: Workers = 2,
     figure: Annotated[Path | None, typer.Option(help="Figure to write (png, pdf, svg).")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Charge the plant of a study file with CC-CV, step charging, nominal and tuned MPC and the plant oracle.
 
     With a table [range]: plants that are drawn from it, with violations and mean times.
     """
+    _read_first(config, "study")
     from chargetune.cli.compare import compare_command
 
-    compare_command(config, store=store, study=study, seed=seed, draws=draws, workers=workers, figure=figure, as_json=as_json)
+    compare_command(
+        config,
+        store=store,
+        study=study,
+        rows=row or [],
+        seed=seed,
+        draws=draws,
+        workers=workers,
+        figure=figure,
+        overwrite=overwrite,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -283,6 +330,7 @@ def certify(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Certificate to write (.json); traces and figure go beside it.")
     ] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Run the tuned controller on fresh episodes of its range of use and bound the probability of a violation.
@@ -312,6 +360,7 @@ def certify(
         },
         workers=workers,
         output=output,
+        overwrite=overwrite,
         as_json=as_json,
     )
 
@@ -353,24 +402,41 @@ def store_export(
     out: Annotated[Path, typer.Option(help="Folder to write to.", show_default=False)],
     study: Annotated[str | None, typer.Option(help="Name of a study; by default all.")] = None,
     form: Annotated[ExportFormat, typer.Option("--format", help="Kind of table.")] = ExportFormat.PARQUET,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write trials and traces as tables, traces with the column names of the Battery Data Format (needs chargetune[export])."""
     from chargetune.cli.store import export_command
 
-    export_command(store, out=out, study=study, form=form.value, as_json=as_json)
+    export_command(store, out=out, study=study, form=form.value, overwrite=overwrite, as_json=as_json)
 
 
 @store_app.command("migrate")
-def store_migrate(store: StoreArgument) -> None:
+def store_migrate(store: StoreArgument, as_json: AsJson = False) -> None:
     """Convert a store of an older version; a copy of the old file stays beside it."""
     from chargetune.cli.store import migrate_command
 
-    migrate_command(store)
+    migrate_command(store, as_json=as_json)
+
+
+def _read_first(path: Path, kind: str) -> None:
+    """Refuse a file with a wrong key before anything heavy is imported, so that the answer comes at once."""
+    from chargetune.battery.studies import study_file
+
+    if kind == "study":
+        study_file.load_config(path)
+    else:
+        from chargetune.battery.studies.campaign_file import CampaignFile
+
+        study_file.read_tables(path, CampaignFile)
 
 
 # What --debug said, for who reports an error after the command has ended.
 _debug: list[bool] = []
+# The command that runs, for who reports that it was interrupted.
+_command: list[str] = []
+# These keep each trial when it is told.
+RESUMABLE = ("tune", "campaign", "reproduce")
 
 
 def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the option's value
@@ -381,10 +447,12 @@ def _version(value: bool) -> None:  # noqa: FBT001 - typer calls it with the opt
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,  # noqa: ARG001
     debug: Annotated[bool, typer.Option("--debug", help="With an error show where in the program it came from.")] = False,
 ) -> None:
     _debug.append(debug)
+    _command[:] = [context.invoked_subcommand or ""]
 
 
 def main() -> None:
@@ -395,13 +463,17 @@ def main() -> None:
     """
     # What a service manager or a shutdown sends is as good a reason to stop in order as Ctrl-C is.
     try:
-        with handled_interrupts():
+        with any_terminal(), handled_interrupts(Watch(_stopping, _interrupted)):
             app()
     except SystemExit as ended:
         # That is what typer makes of KeyboardInterrupt, without a word.
         if ended.code == INTERRUPTED:
-            typer.echo("interrupted; the same command resumes", err=True)
+            _interrupted()
         raise
+    except KeyboardInterrupt:
+        # Before the command had begun.
+        _interrupted()
+        sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - what is not the user's to mend shows its traceback below
         if type(error) is ValueError or isinstance(error, OSError):
             _refuse(error)
@@ -419,6 +491,20 @@ def main() -> None:
         what = f"{type(error).__name__}: {error}"
         typer.echo(f"chargetune: a defect of this program ({what}); please report it with the lines above", err=True)
         sys.exit(DEFECT)
+
+
+def _stopping() -> None:
+    what = "trials that are told are kept" if _resumable() else "what runs is given up"
+    # Whatever stands in the line, a progress bar for instance.
+    typer.echo(f"\nstopping, {what}; a second Ctrl-C ends at once", err=True)
+
+
+def _interrupted() -> None:
+    typer.echo(f"interrupted; the same command {'resumes' if _resumable() else 'begins again'}", err=True)
+
+
+def _resumable() -> bool:
+    return any(name in RESUMABLE for name in _command)
 
 
 def _refuse(error: BaseException) -> NoReturn:

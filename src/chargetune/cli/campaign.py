@@ -16,7 +16,8 @@ from rich.table import Table
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.studies.campaign import Entry, Standing, load_campaign, run_campaign, standings
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, number, shown
+from chargetune.cli.output import console, number, shown, workers_for
+from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.study.executors import process_executor
 from chargetune.study.store.store import Store
 
@@ -29,12 +30,17 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
     """Tune every study file with every seed; exit code 1 when a study had to stop."""
     entries = load_campaign(path)
     kept = store or f"{path.stem}.sqlite"
+    read = {e.source: read_by(e.folder / Path(e.source).name, e.config.model_dump()) for e in entries}
+    if "://" not in kept:
+        inputs = [path, *(file for files in read.values() for file in files)]
+        claim([Output("store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
     _check(entries, force=force)
     with Store(kept) as opened:
         found = standings(opened, entries)
     screen = console(stderr=True)
+    workers = workers_for(workers, len(entries), "studies")
     with ExitStack() as stack:
-        executor = stack.enter_context(process_executor(min(workers, len(entries))))
+        executor = stack.enter_context(process_executor(workers))
         live = None if as_json else stack.enter_context(Live(_table(found.values(), screen.height), console=screen, transient=True))
 
         def note(standing: Standing) -> None:
@@ -52,7 +58,7 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
         for row in rows:
             if row.message is not None:
                 console().print(f"[red]{escape(row.name)}[/] stopped: {escape(row.message)}")
-        console().print(f"trials in {shown(kept)}")
+        console().print(f"trials in {shown(kept)}", markup=False, soft_wrap=True)
     if stopped:
         sys.exit(1)
 

@@ -17,7 +17,8 @@ from chargetune.battery.certification.default_range import default_range
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.range_settings import range_line
 from chargetune.battery.studies.study_file import problem_of_document
-from chargetune.cli.output import beside, console, number
+from chargetune.cli.output import beside, console, number, workers_for
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
@@ -39,6 +40,7 @@ def certify_command(
     changes: Mapping[str, Any],
     workers: int,
     output: Path | None,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Run the theta of a trial, or of the study's result, on fresh episodes of the study's range and write the certificate.
@@ -71,8 +73,12 @@ def certify_command(
     target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
+    what = "certificate" if output is None else "--output"
+    outputs = [Output(what, target, Kind.CERTIFICATE), Output(f"{what}'s figure", target.with_suffix(".png"), Kind.PNG)]
+    claim(outputs, inputs=[location], overwrite=overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     charges: list[Charge] = []
+    workers = workers_for(workers, episodes, "episodes")
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))
@@ -108,8 +114,10 @@ def certify_command(
         return
     screen = console()
     _print(certificate)
-    screen.print(f"certificate {target}\ntraces {target.with_name(certificate['traces']['file'])}\nfigure {figure}", soft_wrap=True)
-    screen.print(f"[dim]recompute every figure from the traces: chargetune verify {target}[/]", soft_wrap=True)
+    traces = target.with_name(certificate["traces"]["file"])
+    screen.print(f"certificate {target}\ntraces {traces}\nfigure {figure}", markup=False, soft_wrap=True)
+    line = f"recompute every figure from the traces: chargetune verify {target}"
+    screen.print(line, style="dim", markup=False, soft_wrap=True)
 
 
 def _with_range(problem: ChargingProblem, changes: Mapping[str, Any]) -> tuple[ChargingProblem, str]:
@@ -124,11 +132,11 @@ def _print(certificate: dict[str, Any]) -> None:
     f, origin = certificate["figures"], certificate["origin"]
     screen = console()
     screen.print(
-        f"[bold]{escape(certificate['cell']['name'])}[/], study {origin['study']!r}, trial {origin['trial']}: "
+        f"[bold]{escape(certificate['cell']['name'])}[/], study {escape(repr(origin['study']))}, trial {origin['trial']}: "
         f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
         soft_wrap=True,
     )
-    screen.print(f"[dim]trial {origin['trial']}: {origin['why']}[/]", soft_wrap=True)
+    screen.print(f"trial {origin['trial']}: {origin['why']}", style="dim", markup=False, soft_wrap=True)
     if certificate["cell"]["remark"]:
         screen.print(f"[dim]{escape(certificate['cell']['remark'])}[/]")
     bound, confidence = f["violation_probability_upper"], certificate["confidence"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,23 +15,30 @@ from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.studies.study_file import load_config
 from chargetune.checks.finding import Finding
 from chargetune.cli.output import console
+from chargetune.cli.outputs import Kind, Output, claim, read_by
+from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["check_command", "facts", "print_findings"]
 
 
-def check_command(path: Path, *, safe: str | None, figures: Path | None, as_json: bool) -> None:
+def check_command(path: Path, *, safe: str | None, figures: Path | None, overwrite: bool, as_json: bool) -> None:
     """Check the formulation of a study file; exit code 1 when an error is found."""
     from chargetune.cli.simulate import parse_theta
 
     config = load_config(path)
     problem = config.problem(path.parent)
     start = None if safe is None else parse_theta(safe, problem, "--safe")
+    if figures is not None:
+        # Which findings there are is not known yet; any of an earlier check may have the name of one.
+        earlier = [p for p in figures.glob("*.png") if re.fullmatch(r"\d+-[a-z-]+", p.stem)] or [figures / "1-finding.png"]
+        claim([Output("--figures", p, Kind.PNG) for p in earlier], inputs=read_by(path, config.model_dump()), overwrite=overwrite)
     screen = console()
     if as_json:
         findings = check_charging(problem, start=start)
     else:
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
+    raise_lost_interrupt()
     drawn: list[Path] = []
     if figures is not None and findings:
         from chargetune.report.figures.check_findings import save_findings
@@ -40,7 +48,7 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, as_json
         print(json.dumps({"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}))  # noqa: T201
     else:
         print_findings(findings, screen)
-        screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), soft_wrap=True)
+        screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)
     if any(f.severity == "error" for f in findings):
         sys.exit(1)
 

@@ -9,11 +9,12 @@ from typing import Any
 
 from rich.table import Table
 
-from chargetune.battery.baselines.comparison import Row, compare, row_names
+from chargetune.battery.baselines.comparison import Row, chosen_rows, compare, row_names
 from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
-from chargetune.cli.output import console, number, result_line, shown
+from chargetune.cli.output import console, number, result_line, shown, workers_for
+from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
 from chargetune.runtime.interrupts import raise_lost_interrupt
@@ -29,16 +30,21 @@ def compare_command(
     *,
     store: str | None,
     study: str | None,
+    rows: list[str],
     seed: int,
     draws: int | None,
     workers: int,
     figure: Path | None,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
         check_format(figure)
     config = load_config(path)
+    if figure is not None:
+        read: list[str | Path] = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
+        claim([Output("--figure", figure, figure_kind(figure))], inputs=read, overwrite=overwrite, folders=False)
     problem = config.problem(path.parent)
     result = None if store is None else _result(store, study or config.study.name)
     theta = None if result is None or result.trial is None else problem.space.validate(result.trial.theta).tolist()
@@ -47,59 +53,70 @@ def compare_command(
             raise ValueError(
                 "--figure is given for a study with a table [range]: each row is many charges; certify draws them by condition"
             )
-        _over_range(problem, theta, result, draws=draws or DRAWS, seed=seed, workers=workers, as_json=as_json)
+        _over_range(problem, theta, result, wanted=rows, draws=draws or DRAWS, seed=seed, workers=workers, as_json=as_json)
         return
     if draws is not None:
         raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
-    names = row_names(problem, theta)
+    names = chosen_rows(row_names(problem, theta), rows)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, Row] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("charging", total=len(names), note="")
-        for row in compare(problem, theta, seed=seed, executor=executor):
+        for row in compare(problem, theta, rows=names, seed=seed, executor=executor):
             raise_lost_interrupt()
             found[row.name] = row
             progress.update(task, advance=1, note=row.name)
-    rows = [found[name] for name in names]
+    done = [found[name] for name in names]
     if figure is not None:
         from chargetune.report.figures.comparison import comparison_figure
         from chargetune.report.figures.style import save
 
-        save(comparison_figure(problem, rows), figure)
+        save(comparison_figure(problem, done), figure)
     if as_json:
-        print(json.dumps({"rows": [_facts(row) for row in rows], "result": None if result is None else result.facts()}))  # noqa: T201
+        print(json.dumps({"rows": [_facts(row) for row in done], "result": None if result is None else result.facts()}))  # noqa: T201
         return
     screen = console()
-    screen.print(_table(rows))
+    screen.print(_table(done))
     screen.print(
         "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), least anode potential, "
         "highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
-        "and is what can be reached.[/]"
+        "and is what can be reached. Chosen is what was set on this very plant: CC-CV's fastest rate and the smallest "
+        "constant backoff with which every limit is kept.[/]"
     )
     if result is not None:
-        screen.print(f"[dim]Tuned MPC: {result_line(result)}[/]", soft_wrap=True)
+        screen.print(f"Tuned MPC: {result_line(result)}", style="dim", markup=False, soft_wrap=True)
     if store is None:
         screen.print("[dim]--store STORE adds the tuned controller of a study.[/]")
     if figure is not None:
-        screen.print(f"figure {figure}")
+        screen.print(f"figure {figure}", markup=False, soft_wrap=True)
 
 
 def _over_range(
-    problem: ChargingProblem, theta: list[float] | None, result: StudyResult | None, *, draws: int, seed: int, workers: int, as_json: bool
+    problem: ChargingProblem,
+    theta: list[float] | None,
+    result: StudyResult | None,
+    *,
+    wanted: list[str],
+    draws: int,
+    seed: int,
+    workers: int,
+    as_json: bool,
 ) -> None:
-    names = range_row_names(problem, theta)
+    names = chosen_rows(range_row_names(problem, theta), wanted)
+    workers = workers_for(workers, len(names), "controllers")
     found: dict[str, RangeRow] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))
         task = progress.add_task("charging", total=len(names), note="")
-        for row in compare_range(problem, theta, draws=draws, seed=seed, executor=executor):
+        for row in compare_range(problem, theta, rows=names, draws=draws, seed=seed, executor=executor):
             raise_lost_interrupt()
             found[row.name] = row
             progress.update(task, advance=1, note=row.name)
     limits = [limit for limit in problem.limits_by_name if limit != "voltage_min_V"]
-    facts = [_range_facts(found[name], found[ORACLE], limits) for name in names]
+    facts = [_range_facts(found[name], found.get(ORACLE), limits) for name in names]
     use = {} if problem.range is None else problem.range.entries
     if as_json:
         print(json.dumps({"range": use, "draws": draws, "rows": facts, "result": None if result is None else result.facts()}))  # noqa: T201
@@ -125,8 +142,8 @@ def _over_range(
         screen.print(f"Tuned MPC: {result_line(result)}", style="dim", markup=False, soft_wrap=True)
 
 
-def _range_facts(row: RangeRow, oracle: RangeRow, limits: list[str]) -> dict[str, Any]:
-    own, best = row.mean("t80_min"), oracle.mean("t80_min")
+def _range_facts(row: RangeRow, oracle: RangeRow | None, limits: list[str]) -> dict[str, Any]:
+    own, best = row.mean("t80_min"), None if oracle is None else oracle.mean("t80_min")
     return {
         "name": row.name,
         "setting": row.setting,
@@ -157,6 +174,7 @@ def _facts(row: Row) -> dict[str, Any]:
     metrics = row.score.metrics if row.score else {}
     return {
         "name": row.name,
+        "setting": row.setting,
         "t80_min": metrics.get("t80_min"),
         "t90_min": metrics.get("t90_min"),
         "worst_excess": row.worst_excess,
@@ -177,13 +195,14 @@ def _extreme(row: Row, signal: str, *, largest: bool, factor: float) -> float | 
 
 def _table(rows: list[Row]) -> Table:
     table = Table(box=None, pad_edge=False)
-    for heading in ("", "t80 min", "t90 min", "overshoot mV", "anode mV", "max K", "limits"):
-        table.add_column(heading, justify="left" if heading in ("", "limits") else "right", no_wrap=True)
+    for heading in ("", "chosen", "t80\nmin", "t90\nmin", "over\nmV", "anode\nmV", "max\nK", "limits"):
+        table.add_column(heading, justify="left" if heading in ("", "chosen", "limits") else "right", no_wrap=True)
     for row in rows:
         facts = _facts(row)
         excess = facts["worst_excess"]
         table.add_row(
             row.name,
+            row.setting,
             number(facts["t80_min"]),
             number(facts["t90_min"]),
             number(excess["voltage_mV"], 1),

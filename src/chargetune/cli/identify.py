@@ -12,12 +12,13 @@ import numpy as np
 from rich.table import Table
 
 from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.identification.cycler_files import read_record
+from chargetune.battery.identification.cycler_files import Reading, read_record
 from chargetune.battery.identification.pulse_fit import Identification, cell_toml, identify, predicted_voltage
-from chargetune.battery.identification.pulses import segments
-from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.record import Record, segments
 from chargetune.cli.output import console
+from chargetune.cli.outputs import Kind, Output, claim, figure_kind
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.files import write_whole
 
 __all__ = ["identify_command"]
@@ -33,17 +34,25 @@ def identify_command(
     name: str | None,
     figure: Path | None,
     check: list[Path],
+    series: int,
+    parallel: int,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Fit a cell to measured pulses, write it, and say how well it fits."""
     if figure is not None:
         check_format(figure)
-    slow = None if ocv is None else read_record(ocv)
-    known = [read_record(path) for path in check]
-    found = identify(read_record(data), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
+    drawn = [] if figure is None else [Output("--figure", figure, figure_kind(figure))]
+    read = [data, *([] if ocv is None else [ocv]), *check]
+    claim([Output("--output", out, Kind.CELL), *drawn], inputs=read, overwrite=overwrite)
+    reading = Reading(series=series, parallel=parallel)
+    slow = None if ocv is None else read_record(ocv, reading)
+    known = [read_record(path, reading) for path in check]
+    found = identify(read_record(data, reading), rc=cast("Literal[1, 2]", rc), capacity_Ah=capacity_Ah, ocv=slow, name=name or data.stem)
     checks = [(record.source, *_check(found, record)) for record in known]
     today = datetime.now().astimezone().date().isoformat()
-    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}."))
+    found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}.", series=series, parallel=parallel))
+    raise_lost_interrupt()
     out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(out, cell_toml(found.cell, found.remarks))
     # What was written is what a controller will read.
@@ -52,6 +61,7 @@ def identify_command(
         from chargetune.report.figures.identification import identification_figure
         from chargetune.report.figures.style import save
 
+        figure.parent.mkdir(parents=True, exist_ok=True)
         save(identification_figure(replace(found, cell=cell)), figure)
     if as_json:
         document: dict[str, Any] = {
@@ -70,6 +80,8 @@ def identify_command(
         line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
         screen.print(line, markup=False, soft_wrap=True)
     screen.print(f"cell in {out}" + (f"\nfigure {figure}" if figure else ""), markup=False, soft_wrap=True)
+    if found.cell.pack_line:
+        screen.print(found.cell.pack_line, markup=False, soft_wrap=True)
     screen.print(f"next: put the limits of its data sheet into it, then chargetune init --cell {out}", markup=False, soft_wrap=True)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from chargetune.battery.cell.cell import load_cell
 from chargetune.battery.studies.study_file import load_config
 from chargetune.cli.output import console
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.study.files import write_whole
 
 __all__ = ["init_command"]
@@ -56,6 +57,11 @@ name = "backoff_sd" # margin in standard deviations of the predicted voltage
 lower = 0.1
 upper = 6.0
 
+# The ramp of the current can be tuned as well:
+# [theta.current_ramp]
+# lower_A_s = {ramp_least:.3g}
+# upper_A_s = {ramp_most:.3g}
+
 # What differs between the cells and the charges that the controller will meet; the certificate is drawn from the same.
 [range]
 soc_start = [0.05, 0.5]
@@ -67,19 +73,17 @@ growth = 0.2             # and all resistances have grown by this one
 """
 
 
-def init_command(path: Path, *, cell: Path | None) -> None:
-    """Write a commented study file that runs. Raises ValueError where there is one already, or the cell file is none."""
-    if path.exists():
-        raise ValueError(f"{path} exists, allowed is the name of a new file")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no folder {path.parent}")
+def init_command(path: Path, *, cell: Path | None, overwrite: bool) -> None:
+    """Write a commented study file that runs. Raises ValueError where it may not be written, or the cell file is none."""
+    claim([Output("study file", path, Kind.STUDY)], inputs=[] if cell is None else [cell], overwrite=overwrite, folders=False)
     largest = 6.0
     line = '# file = "cell.toml" # as `chargetune identify` writes it; without it the case study\'s cell'
     if cell is not None:
         largest = load_cell(cell).current_max_A
         line = f"file = {json.dumps(os.path.relpath(cell, path.parent))}"
-    # A minute from rest to the largest current.
-    text = TEXT.format(name=path.name, stem=path.stem, cell=line, ramp=largest / 60)
+    # A minute from rest to the largest current; tuned, between five minutes and six seconds.
+    ramp = {"ramp": largest / 60, "ramp_least": largest / 300, "ramp_most": largest / 6}
+    text = TEXT.format(name=path.name, stem=path.stem, cell=line, **ramp)
     write_whole(path, text)
     load_config(path).problem(path.parent)
     console().print(f"study file in {path}\nnext: chargetune check {path}", markup=False, soft_wrap=True)

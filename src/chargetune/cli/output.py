@@ -12,11 +12,12 @@ from rich.table import Table
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.wording import limit_words, metric_words, objective_words
 from chargetune.episode.score import Score
+from chargetune.study.executors import bounded_workers
 from chargetune.study.result import StudyResult
 from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 
-__all__ = ["beside", "console", "loss_of", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines"]
+__all__ = ["beside", "console", "loss_of", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "workers_for"]
 
 # Figures of a charge beside its objective and its limits.
 ROWS = ("t80_min", "t90_min", "t95_min", "t99_min", "switch_min", "soc_end", "violation_mVs", "solver_failures")
@@ -99,6 +100,14 @@ def plants_over(score: Score | None) -> str:
     """Of a trial over a range of use the drawn plants that broke a limit, "n of N"; a dash for any other trial."""
     drawn = {} if score is None else score.metrics
     return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
+
+
+def workers_for(wanted: int, work: int, what: str) -> int:
+    """The number of worker processes; where fewer than wanted can have something to do, one line on stderr says so."""
+    count, said = bounded_workers(wanted, work, what)
+    if said:
+        console(stderr=True).print(f"--{said}", markup=False, soft_wrap=True)
+    return count
 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:

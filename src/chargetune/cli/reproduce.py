@@ -11,7 +11,8 @@ from rich.table import Table
 from chargetune.battery.case_study.configurations import case_study
 from chargetune.battery.case_study.reproduce import reproduce, summarise
 from chargetune.battery.studies.study_file import TunerName
-from chargetune.cli.output import console, number
+from chargetune.cli.output import console, number, workers_for
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
@@ -34,14 +35,29 @@ def seed_list(text: str) -> list[int]:
     return seeds
 
 
-def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers: int, out: Path, as_json: bool) -> None:
+def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers: int, out: Path, overwrite: bool, as_json: bool) -> None:
     """Run the study for every seed, decide the claims, draw the figures."""
     from chargetune.report import save_figures, seeds_figure
 
     numbers, name = seed_list(seeds), cast("TunerName", tuner)
-    out.mkdir(parents=True, exist_ok=True)
     path = out / f"{case}-{tuner}.sqlite"
-    with process_executor(min(workers, len(numbers))) as executor, bar(quiet=as_json) as progress:
+    drawn = out / f"{case}-{tuner}-seed{numbers[0]}"
+    tables = [out / "claims.json", out / f"claims-{case}-{tuner}.json"]
+    # Studies that are found in the folder go on, and what was made of them is made again.
+    own = overwrite or _is_claims(tables[0])
+    claim(
+        [
+            Output("store", path, Kind.STORE, renewed=True),
+            *(Output("--out", table, Kind.JSON, renewed=own) for table in tables),
+            Output("--out", out / f"{case}-{tuner}-seeds.png", Kind.PNG, renewed=own),
+            *(Output("--out", drawn / f"{stem}.png", Kind.PNG, renewed=own) for stem in ("trajectories", "backoff", "R1", "convergence")),
+        ],
+        inputs=[],
+        overwrite=overwrite,
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    workers = workers_for(workers, len(numbers), "seeds")
+    with process_executor(workers) as executor, bar(quiet=as_json) as progress:
         task = progress.add_task(f"{case}, {tuner}", total=len(numbers), note="")
         safe = 0
 
@@ -53,9 +69,9 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
 
         rows = reproduce(case, numbers, trials=trials, tuner=name, path=path, executor=executor, progress=note)
     result = summarise(out, case, name, rows, trials)
-    for target in (out / "claims.json", out / f"claims-{case}-{tuner}.json"):
+    for target in tables:
         write_whole(target, json.dumps(result, indent=1))
-    figures = save_figures(path, case_study(case, numbers[0], name).study.name, out / f"{case}-{tuner}-seed{numbers[0]}", trials=trials)
+    figures = save_figures(path, case_study(case, numbers[0], name).study.name, drawn, trials=trials)
     seeds_figure(rows, out / f"{case}-{tuner}-seeds.png")
     if as_json:
         print(json.dumps(result))  # noqa: T201
@@ -71,14 +87,23 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     table = Table(box=None, pad_edge=False, title="Claims", title_justify="left")
     for heading in ("", "claim", "holds"):
         table.add_column(heading)
-    for claim in result["claims"]:
+    for found in result["claims"]:
         table.add_row(
-            str(claim["id"]),
-            claim["text"],
-            f"{claim['holds']} of {claim['of']}" if claim["of"] else "needs the other study in the same --out",
+            str(found["id"]),
+            found["text"],
+            f"{found['holds']} of {found['of']}" if found["of"] else "needs the other study in the same --out",
         )
     screen.print(table)
-    screen.print(f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")))
+    screen.print(
+        f"{out / 'claims.json'}" + "".join(f"\n{f}" for f in (*figures, out / f"{case}-{tuner}-seeds.png")), markup=False, soft_wrap=True
+    )
+
+
+def _is_claims(path: Path) -> bool:
+    try:
+        return bool({"case", "tuner", "claims", "per_seed"} <= json.loads(path.read_text(encoding="utf-8")).keys())
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def _rows_table(rows: list[dict[str, Any]]) -> Table:

@@ -138,6 +138,7 @@ def _summary(view: StudyView) -> dict[str, Any]:
         "created_at": "" if view.record is None else view.record.created_at,
         "done": sum(t.status is TrialStatus.DONE for t in trials),
         "failed": sum(t.status is TrialStatus.FAILED for t in trials),
+        "apart": sum(t.status is TrialStatus.APART for t in trials),
         "running": sum(t.status is TrialStatus.RUNNING for t in trials),
         "violating": sum(t.score is not None and not t.score.feasible for t in trials),
         "best": _trial(best) if best else None,

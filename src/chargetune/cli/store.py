@@ -10,11 +10,13 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from chargetune.battery.studies.bdf_export import Format, export
+from chargetune.battery.studies.bdf_export import Format, export, planned_files
 from chargetune.cli.output import console, shown
+from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.study.store.damaged_reader import Damage
 from chargetune.study.store.integrity import check_store
 from chargetune.study.store.salvage import salvage
+from chargetune.study.store.schema import SCHEMA_VERSION
 from chargetune.study.store.store import Store
 
 __all__ = ["check_command", "export_command", "migrate_command", "salvage_command"]
@@ -40,6 +42,9 @@ def check_command(location: str, *, as_json: bool) -> None:
 
 def salvage_command(location: str, target: str, *, as_json: bool) -> None:
     """Copy what is whole, and name what was left."""
+    if "://" not in target:
+        # That a store is there is refused where its studies are known.
+        claim([Output("NEW", Path(target), Kind.STORE, renewed=True)], inputs=[location], overwrite=False, folders=False)
     with _steps("traces", quiet=as_json) as step:
         saved = salvage(location, target, step)
     counts = {"studies": saved.studies, "trials": saved.trials, "traces": saved.traces}
@@ -51,11 +56,15 @@ def salvage_command(location: str, target: str, *, as_json: bool) -> None:
     console().print(f"{saved.store}: {_counted(counts)} saved; {closing}", markup=False, soft_wrap=True)
 
 
-def export_command(location: str, *, out: Path, study: str | None, form: Format, as_json: bool) -> None:
+def export_command(location: str, *, out: Path, study: str | None, form: Format, overwrite: bool, as_json: bool) -> None:
     """Write trials and traces as tables."""
-    with Store(location, read_only=True) as store, _steps("trials", quiet=as_json) as step:
+    kinds = {".json": Kind.JSON, ".csv": Kind.CSV, ".parquet": Kind.PARQUET}
+    with Store(location, read_only=True) as store:
+        planned = planned_files(store, out, study=study, form=form)
+        claim([Output("--out", p, kinds[p.suffix]) for p in planned], inputs=[location], overwrite=overwrite)
         try:
-            written = export(store, out, study=study, form=form, step=step)
+            with _steps("trials", quiet=as_json) as step:
+                written = export(store, out, study=study, form=form, step=step)
         except ImportError as error:
             raise ValueError(str(error)) from error
     if as_json:
@@ -65,10 +74,15 @@ def export_command(location: str, *, out: Path, study: str | None, form: Format,
     console().print(f"{len(written.files)} files in {out}", markup=False, soft_wrap=True)
 
 
-def migrate_command(location: str) -> None:
+def migrate_command(location: str, *, as_json: bool) -> None:
     """Bring a store of an older schema to this one; opening it for writing does that."""
+    if "://" not in location and not Path(location).exists():
+        raise ValueError(f"{location}: no such store")
     with Store(location):
         pass
+    if as_json:
+        print(json.dumps({"store": shown(location), "schema_version": SCHEMA_VERSION}))  # noqa: T201
+        return
     console().print(f"{shown(location)}: has this program's schema", markup=False, soft_wrap=True)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column
 
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.charging.problem import ChargingProblem
@@ -23,9 +24,11 @@ from chargetune.battery.charging.wording import objective_words
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, loss_of, metrics_table, number, result_line, shown, theta_lines
+from chargetune.cli.output import console, loss_of, metrics_table, number, result_line, shown, theta_lines, workers_for
+from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
+from chargetune.runtime.notes import first_line
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
 from chargetune.study.result import StudyResult, read_result
@@ -37,14 +40,14 @@ __all__ = ["bar", "tune_command"]
 
 
 def bar(*, quiet: bool) -> Progress:
-    """A progress bar on stderr, so that a program can read stdout."""
+    """A progress bar on stderr, so that a program can read stdout. At 80 columns the note is what goes on in a second line."""
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[note]}", markup=False, table_column=Column(overflow="fold")),
     )
     return Progress(*columns, console=console(stderr=True), disable=quiet)
 
@@ -60,41 +63,64 @@ def tune_command(
     as_json: bool,
     force: bool = False,
     accept_changed: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Tune, show the way there, and say what came of it. An error of the formulation stops before the first trial, unless ``force``."""
     config = load_config(path)
     if seed is not None:
         config = config.model_copy(update={"study": config.study.model_copy(update={"seed": seed})})
     count = config.study.trials if trials is None else trials
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     kept = store or str(out / "study.sqlite" if out else f"{path.stem}.sqlite")
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
+    outputs = [] if "://" in kept else [Output("store", Path(kept), Kind.STORE, renewed=True)]
+    if out is not None:
+        outputs += _files(out, config, problem, kept)
+    claim(outputs, inputs=read_by(path, config.model_dump()), overwrite=overwrite)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
     _check(problem, problem.safe_start, force=force)
     opening = Opening(config, path.parent, kept, accept_changed)
-    everything, result, safety = _run(opening, problem, count, workers, quiet=as_json)
+    everything, more, result, safety = _run(opening, problem, count, workers, quiet=as_json)
+    now = [t for t in everything if t.status is not TrialStatus.APART]
+    summary = {**_summary(config, problem, now, result), "trials": len(everything), "apart": len(everything) - len(now)}
+    summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
         from chargetune.report import save_figures
 
+        # First what says whose folder this is.
+        write_whole(out / "summary.json", json.dumps({**summary, "store": shown(kept)}, indent=1))
         figures = save_figures(kept, config.study.name, out, trials=count)
-    summary = _summary(config, problem, everything, result)
-    summary |= {"safety": safety} if safety else {}
-    if out is not None:
-        write_whole(out / "summary.json", json.dumps(summary, indent=1))
     if as_json:
         print(json.dumps(summary))  # noqa: T201
-        _end(safety, everything)
+        _end(safety, now)
         return
-    _closing(problem, everything, result, config.study.tuner)
+    _closing(problem, now, result, config.study.tuner)
+    if more:
+        console().print(f"the study has {len(everything) + more} trials; these are the first {len(everything)} of them, as --trials asks")
     if safety:
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
         console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
-    console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures))
-    _end(safety, everything)
+    console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures), markup=False, soft_wrap=True)
+    _end(safety, now)
+
+
+def _files(out: Path, config: Config, problem: ChargingProblem, kept: str) -> list[Output]:
+    """What is written into ``out``. Where an earlier run of this study wrote there, the same command renews it."""
+    summary = out / "summary.json"
+    try:
+        found = json.loads(summary.read_text(encoding="utf-8"))
+        own = (found["study"], found.get("store", shown(kept))) == (config.study.name, shown(kept))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        own = False
+    tuned = problem.theta
+    stems = ["trajectories", "convergence", *tuned.ratios]
+    stems += [name for name, table in (("backoff", tuned.backoff), ("current_limit", tuned.current_limit)) if table is not None]
+    figures = [Output("--out", out / f"{stem}.png", Kind.PNG, renewed=own) for stem in stems]
+    return [Output("--out", summary, Kind.JSON, renewed=own), *figures]
 
 
 @dataclass(frozen=True)
@@ -109,21 +135,26 @@ class Opening:
 
 def _run(
     opening: Opening, problem: ChargingProblem, count: int, workers: int, *, quiet: bool
-) -> tuple[list[Trial], StudyResult, dict[str, Any] | None]:
-    """The trials of the study, its result, and what there is to say of safety."""
+) -> tuple[list[Trial], int, StudyResult, dict[str, Any] | None]:
+    """The trials of the study that are asked for, how many more it has, its result, and what there is to say of safety."""
     config, kept = opening.config, opening.kept
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
         study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed))
-        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
+        # Without batches more workers have something to do only if the order of the trials is given up for them; and
+        # not with a tuner whose every step needs the trial before it.
+        alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
+        at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
+        workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
+        executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
         task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
         if study.earlier and not quiet:
             progress.console.print(f"begun with {len(study.earlier)} trials of earlier studies")
         if done and not quiet:
-            progress.console.print(f"resumed: {done} trials are in {shown(kept)}")
+            progress.console.print(f"resumed: {done} trials are in {shown(kept)}", markup=False, soft_wrap=True)
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
@@ -137,19 +168,17 @@ def _run(
 
         stopped = ""
         try:
-            # Without batches more workers have something to do only if the order of the trials is given up for them; and
-            # not with a tuner whose every step needs the trial before it.
-            alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
             ahead = workers if workers > 1 and not alone else None
             study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
-        everything = study.trials()[:count]
+        stored = study.trials()
+        everything, more = stored[:count], max(0, len(stored) - count)
         safety = _safety(config, problem, study, everything, stopped)
         # After a study that stopped, too.
         study.result()
         result = read_result(store, study.record, everything)
-    return everything, result, safety
+    return everything, more, result, safety
 
 
 def _headline(config: Config, problem: ChargingProblem, score: Score) -> str:
@@ -166,7 +195,7 @@ def _said(screen: Console) -> Iterator[None]:
     """Warnings of a tuner as lines above the progress bar."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", RuntimeWarning)
-        warnings.showwarning = lambda message, *_, **__: screen.print(f"[yellow]{escape(str(message))}[/]")
+        warnings.showwarning = lambda message, *_, **__: screen.print(f"note: {first_line(message)}", style="yellow", markup=False)
         yield
 
 
@@ -220,10 +249,16 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
-    screen.print(f"\n[bold]{escape(problem.cell.name)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    screen.print(f"\n[bold]{escape(problem.cell.title)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    for line in problem.setting_lines:
+        screen.print(f"[dim]{escape(line)}[/]")
     if problem.cell.remark:
         screen.print(f"[dim]{escape(problem.cell.remark)}[/]")
     screen.print(f"[dim]estimator {problem.estimator.line}[/]")
+    if all(t.score is None for t in everything):
+        # There is nothing that a table could show.
+        screen.print(result_line(result), markup=False, soft_wrap=True)
+        return
     first = everything[0].score if everything else None
     scores = {_start_label(problem, everything): first, "tuned": best.score if best else None}
     screen.print(metrics_table(scores, problem, tuner))
@@ -233,7 +268,7 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
         said = f"[red]None of these {len(everything)} trials kept the limits.[/] Shown is the one that came closest."
         screen.print(f"{said} More trials or a wider theta may help.")
     units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
-    screen.print(result_line(result), soft_wrap=True)
+    screen.print(result_line(result), markup=False, soft_wrap=True)
     screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
 
 from chargetune.cli.output import console
+from chargetune.runtime.interrupts import unwatched
 from chargetune.study.store.store import Store
 
 __all__ = ["web_command"]
@@ -27,19 +29,28 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
     with Store(location, read_only=True) as store:
         label = store.label  # what cannot be shown is refused now
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family) as listening:
+    with _listening(host, port, family) as listening:
         bound = listening.getsockname()[1]
         config = uvicorn.Config(
             make_app(location, token=token, hosts=frozenset({host.lower()}), ending=lambda: server.should_exit),
             log_level="warning",
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=3,
+            timeout_graceful_shutdown=2,
         )
         server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
-        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", soft_wrap=True)
+        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", markup=False, soft_wrap=True)
         # uvicorn passes Ctrl-C on once it has ended in good order.
-        with contextlib.suppress(KeyboardInterrupt):
+        with contextlib.suppress(KeyboardInterrupt), unwatched():
             server.run(sockets=[listening])
+
+
+def _listening(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise ValueError(f"--port {port} is taken on {host} by another program; --port 0 takes a free one") from error
+        raise

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 
 from chargetune.control.convexity import nearby_convex
+from chargetune.control.estimators import finite
 from chargetune.runtime.split import split
 
 __all__ = ["Bend", "Linearisation", "dense", "straight"]
@@ -71,6 +72,18 @@ class Linearisation:
     def _packed(self, hessian: Any) -> Any:
         parts = zip(_hessians(hessian, self.patterns[6].size1()), self.patterns[6:], strict=True)
         return ca.vertcat(*(ca.vertcat(*ca.project(one, pattern).nonzeros()) for one, pattern in parts))
+
+    @property
+    def at_start(self) -> ca.Function:
+        """D -> D of the first interval: what is not finite of the derivatives with respect to its state, which is given, is 0.
+
+        They multiply a change of 0. One that is infinite, of a root at 0 for example, would make that no number.
+        """
+        vector = ca.SX.sym("D", self.length)
+        pieces = split(vector, (pattern.nnz() for pattern in self.patterns))
+        of_state = (True, False, True, False, True, False, True, True, False)
+        kept = (ca.if_else(finite(piece), piece, 0) if known else piece for piece, known in zip(pieces, of_state, strict=True))
+        return ca.Function("at_start", [vector], [ca.vertcat(*kept)])
 
     @property
     def length(self) -> int:

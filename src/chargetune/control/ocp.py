@@ -208,10 +208,10 @@ def control_problem(controller: Controller) -> Problem:
         prepare=ca.Function("prepare", [theta, setpoint, nominal], [prepared]),
         bounds=bounds,
         clip=clip,
-        sweep=_sweep(layout, packed_stage, packed_final, window),
+        sweep=_sweep(layout, packed_stage, packed_final, window, stage.at_start),
         scaling=lean(scaling(layout, stage, final)),
         quadratic=lean(quadratic(layout, stage, final)),
-        curvature=curvature(layout, [row_weight(i, horizon) for i in range(horizon)], follow, seconds, adjoints, window),
+        curvature=curvature(layout, [row_weight(i, horizon) for i in range(horizon)], follow, seconds, adjoints, window, stage.at_start),
         convex=convex(layout, stage, final, exact=exact),
         residual=lean(residual(layout, adjoints)),
         merit=lean(merit(layout)),
@@ -233,7 +233,8 @@ def _rate_rows(controller: Controller, u: Any, last: Any, lower: Any, upper: Any
     span = span_of(lower, upper)[own]
     above = u[own] - ca.fmax(last[own] + rate, lower[own])
     below = ca.fmin(last[own] - rate, upper[own]) - u[own]
-    return ca.vertcat(above / span, below / span)
+    # fmax and fmin drop a rate that is no number.
+    return ca.vertcat(*(ca.if_else(rate >= 0, row / span, np.nan) for row in (above, below)))
 
 
 def _bounds(controller: Controller, layout: Layout, bound: ca.Function, window: Window) -> tuple[ca.Function, ca.Function]:
@@ -249,12 +250,15 @@ def _bounds(controller: Controller, layout: Layout, bound: ca.Function, window: 
     lowers, uppers, clipped = [], [], []
     for i, (u, (low, high, rate)) in enumerate(zip(split(inputs, [nu] * len(firsts)), stages, strict=True)):
         least, most = ca.MX(low), ca.MX(high)
+        told_least, told_most = ca.MX(low), ca.MX(high)
         for k, j in enumerate(controller.rated):
             least[j] = ca.fmin(ca.fmax(low[j], last[j] - rate[k]), high[j])
             most[j] = ca.fmax(ca.fmin(high[j], last[j] + rate[k]), low[j])
+            # What is applied keeps the bounds even where the rate is no number; solved such a problem is not.
+            told_least[j], told_most[j] = (ca.if_else(rate[k] >= 0, bound, np.nan) for bound in (least[j], most[j]))
         # From the second block on the rate is a row of the problem: what the input may be depends on the one before.
-        lowers.append(least if i == 0 else low)
-        uppers.append(most if i == 0 else high)
+        lowers.append(told_least if i == 0 else low)
+        uppers.append(told_most if i == 0 else high)
         last = ca.fmin(ca.fmax(u, least), most)
         clipped.append(last)
     bounds = ca.Function("bounds", [now, q], [ca.vertcat(*lowers), ca.vertcat(*uppers)])
@@ -265,13 +269,13 @@ def _group(controller: Controller, *places: str) -> tuple[int, ...]:
     return tuple(j for j, limit in enumerate(controller.limits) if limit.at in places for _ in range(limit.rows.size1_out(0)))
 
 
-def _sweep(layout: Layout, stage: ca.Function, final: ca.Function, window: Window) -> ca.Function:
+def _sweep(layout: Layout, stage: ca.Function, final: ca.Function, window: Window, at_start: ca.Function) -> ca.Function:
     now, inputs, q = ca.MX.sym("now", stage.size1_in(0)), ca.MX.sym("U", layout.size), ca.MX.sym("q", window.length)
     x, cost, rows, derivatives = now, ca.MX(0.0), [], []
     for i, u in enumerate(layout.inputs(inputs)):
         x, stage_cost, row, packed = stage(x, u, now, window.at(q, i), row_weight(i, layout.horizon))
         cost = cost + stage_cost
         rows.append(row)
-        derivatives.append(packed)
+        derivatives.append(packed if i else at_start(packed))
     final_cost, row, packed = final(x, now, window.at(q, layout.horizon))
     return ca.Function("sweep", [now, inputs, q], [cost + final_cost, ca.vertcat(*rows, row), ca.vertcat(*derivatives, packed)])

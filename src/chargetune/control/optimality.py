@@ -61,8 +61,9 @@ def residual(layout: Layout, adjoints: tuple[ca.Function, ca.Function]) -> ca.Fu
         spent = layout.sums(multipliers) / (gamma * ca.DM(layout.prices))
         residuals.append(least(s, 1 + s - spent))
     everything = ca.fabs(ca.vertcat(*residuals))
-    # A maximum drops a NaN; the sum keeps it.
-    worst = ca.if_else(ca.logic_and(finite(ca.sum1(everything)), gamma > 0), largest(everything.T), np.inf)
+    # A maximum drops a NaN, also that of a pair above; sums keep it.
+    known = ca.sum1(everything) + ca.sum1(ca.fabs(ca.vertcat(gradient, rows, multipliers)))
+    worst = ca.if_else(ca.logic_and(finite(known), gamma > 0), largest(everything.T), np.inf)
     return ca.Function("residual", [inputs, rows, vector, multipliers, gamma, lower, upper], [worst])
 
 
@@ -73,6 +74,7 @@ def curvature(
     seconds: tuple[ca.Function, ca.Function],
     adjoints: tuple[ca.Function, ca.Function],
     window: Window,
+    at_start: ca.Function,
 ) -> ca.Function:
     """`Problem.curvature`: to the derivatives what the second ones of stage and end add, an interval after the other from the end."""
     (second, second_final), (back, end) = seconds, adjoints
@@ -90,7 +92,7 @@ def curvature(
     out: list[Any] = [last_derivatives + second_final(states[-1], now, window.at(q, horizon), last_price)]
     for i in reversed(range(horizon)):
         bent = second(states[i], controls[i], now, window.at(q, i), weights[i], costate, prices[i])
-        out.insert(0, derivatives[i] + bent)
+        out.insert(0, derivatives[i] + bent if i else at_start(derivatives[i] + bent))
         costate, _ = back(derivatives[i], costate, prices[i], 1.0)
     return ca.Function("curvature", [now, inputs, vector, multipliers, q], [ca.vertcat(*out)])
 

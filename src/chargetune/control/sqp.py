@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.control.condensing import span_of
 from chargetune.control.estimators import finite
 from chargetune.control.ocp import Problem
 from chargetune.control.qp import QPSolver, daqp
@@ -33,6 +34,9 @@ HALVINGS_MAX = 6
 # Iterations from this one on take the curvature of constraints and dynamics into account. Gauss-Newton steps are cheaper and
 # mostly converge in one or two; along a limit that is bent in the input, as that of a temperature is, they go back and forth.
 CURVED_FROM = 2
+# A first iterate at which a derivative is infinite, as that of a root at an input's bound, moves in by this share of the input's range, as
+# IPOPT's bound_push does.
+INSIDE = 1e-2
 # Violations of this share of a limit's scale come from the QP solver's own tolerance.
 MERIT_ROUNDING = 1e-9
 
@@ -75,8 +79,7 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     known = ca.vertcat(ca.if_else(finite(ca.sum1(ca.fabs(estimate))), estimate, ca.DM.zeros(estimate.shape[0])), last_inputs)
     lower, upper = problem.bounds(known, q)
     before, dual_before = split(warm, (size, duals))
-    start = problem.clip(known, before, q)
-    cost, rows, derivatives = problem.sweep(now, start, q)
+    start, cost, rows, derivatives = _begin(problem)(now, known, problem.clip(known, before, q), lower, upper, q)
     found, dual, kkt, count = more(now, start, rows, derivatives, problem.merit(cost, rows), dual_before, lower, upper, q)
     usable = finite(ca.sum1(ca.fabs(found)))
     declared = ca.repmat(problem.fallback(known, q), len(problem.layout.blocks), 1)
@@ -87,6 +90,23 @@ def solver(problem: Problem, qp: QPSolver = daqp) -> ca.Function:
     following = ca.vertcat(*problem.layout.later(held), usable_dual[_shift(problem)])
     names = ["U", "warm_next", "status", "kkt", "iterations"]
     return ca.Function("solver", [now, warm, q], [bounded, following, status, kkt, count], ["now", "warm", "q"], names)
+
+
+def _begin(problem: Problem) -> ca.Function:
+    """(now, known, U, lower, upper, q) -> (U, J, c, D) at U, or inside the bounds where a derivative at U is not finite."""
+    names = (("now", problem.sweep.size1_in(0)), ("known", problem.sweep.size1_in(0)), ("U", problem.size))
+    arguments = [ca.MX.sym(name, rows) for name, rows in (*names, ("lower", problem.size), ("upper", problem.size))]
+    now, known, inputs, lower, upper = arguments
+    q = ca.MX.sym("q", problem.sweep.size1_in(2))
+    there = problem.sweep(now, inputs, q)
+    room = INSIDE * span_of(lower, upper)
+    moved = problem.clip(known, ca.fmin(ca.fmax(inputs, lower + room), upper - room), q)
+    kept = [ca.MX.sym("kept", *part.shape) for part in (inputs, *there)]
+    stay = ca.Function("stay", [*arguments, q, *kept], kept)
+    inside = ca.Function("inside", [*arguments, q, *kept], [moved, *problem.sweep(now, moved, q)])
+    branch = ca.Function.if_else("where", inside, stay)
+    lost = ca.logic_not(finite(ca.sum1(ca.fabs(there[2]))))
+    return ca.Function("begin", [*arguments, q], list(branch(lost, *arguments, q, inputs, *there)))
 
 
 def cold(problem: Problem, inputs: NDArray[np.float64]) -> NDArray[np.float64]:

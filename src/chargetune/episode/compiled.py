@@ -7,8 +7,9 @@ thetas, seeds and mismatches builds it once. It gives the same trajectory as `ru
 from __future__ import annotations
 
 import hashlib
+import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -66,34 +67,35 @@ class CompiledEpisode:
         seed: int | Sequence[int] = 0,
         tables: Sequence[NDArray[np.float64] | None] | None = None,
         *,
-        given: Given | None = None,
+        given: Given | Sequence[Given] | None = None,
     ) -> list[Episode]:
         """An ensemble: one closed loop of each theta on the plant of the same place, on all cores of this process.
 
-        The plants have the model of ``plant`` with other parameters, starts or sensors, and all the same given signals. The same
-        episodes as of one after the other. ``seed`` is one for all of them, or one each.
+        The plants have the model of ``plant`` with other parameters, starts or sensors. The same episodes as of one after the other.
+        ``seed`` and ``given`` are one for all of them, or one each.
         What each of ``tables`` (`LookupTable`) says of the true outputs is added to what is measured, and so read by the estimator.
         Raises ValueError when there are not as many of all, or one does not fit.
         """
         tables = [None] * len(plants) if tables is None else tables
         seeds = [seed] * len(plants) if isinstance(seed, int) else list(seed)
-        if not len(thetas) == len(plants) == len(tables) == len(seeds):
-            counts = f"{len(thetas)} thetas, {len(plants)} plants, {len(seeds)} seeds and {len(tables)} tables"
+        cases = [given] * len(plants) if given is None or isinstance(given, Mapping) else list(given)
+        if not len(thetas) == len(plants) == len(tables) == len(seeds) == len(cases):
+            counts = f"{len(thetas)} thetas, {len(plants)} plants, {len(seeds)} seeds, {len(tables)} tables and {len(cases)} given"
             raise ValueError(f"{counts}, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")
         # An ensemble has few thetas, slopes have few plants: what depends on one of them alone is computed once for each.
-        of_theta: dict[bytes, list[NDArray[np.float64]]] = {}
-        of_plant: dict[tuple[int, int], _OfPlant] = {}
-        told = self._told(given)
+        of_theta: dict[tuple[bytes, int], list[NDArray[np.float64]]] = {}
+        of_plant: dict[tuple[int, int, int], _OfPlant] = {}
+        of_case = {id(case): self._told(case) for case in cases}
         fixed, unknown = [], []
-        for theta, plant, table, own in zip(thetas, plants, tables, seeds, strict=True):
-            values = self.controller.theta_vector(theta)
-            key = values.tobytes()
+        for theta, plant, table, own, case in zip(thetas, plants, tables, seeds, cases, strict=True):
+            values, told = self.controller.theta_vector(theta), of_case[id(case)]
+            key = values.tobytes(), id(case)
             if key not in of_theta:
                 of_theta[key] = self._of_theta(values, told)
-            drawn = id(plant), own
+            drawn = id(plant), own, id(case)
             if drawn not in of_plant:
                 check_run(plant, self.steps, own, ())
                 of_plant[drawn] = self._of_plant(plant, own, told)
@@ -219,6 +221,12 @@ def compiled_episode(
     key = f"episode {controller.structure} {own} {steps} {use and compiler_flags()} {compiled is None} {indices} {lookup_table}"
 
     def build() -> tuple[ca.Function, ca.Function, bool]:
+        if compiled is None and not use and "CHARGETUNE_CC" not in os.environ:
+            warnings.warn(
+                "there is no C compiler: episodes run on the virtual machine, about 8 times slower; install gcc or clang",
+                RuntimeWarning,
+                stacklevel=5,
+            )
         try:
             return *(_compiled if use else _built)(controller, plant, indices, steps, lookup_table), use
         except (RuntimeError, OSError) as error:

@@ -48,8 +48,8 @@ class Score:
 
     @property
     def worst(self) -> float:
-        """The largest of `beyond`: more than 0 when a limit is broken; -inf where there is no limit."""
-        return max(self.beyond.values(), default=-math.inf)
+        """The largest of `beyond`: more than 0 when a limit is broken; inf where one is no number, -inf where there is no limit."""
+        return max((math.inf if math.isnan(value) else value for value in self.beyond.values()), default=-math.inf)
 
     @property
     def feasible(self) -> bool:

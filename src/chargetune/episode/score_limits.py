@@ -60,10 +60,15 @@ class ScoredLimit:
     def excess(self, episode: Episode) -> NDArray[np.float64]:
         """By how much each interval is beyond the limit, the worse of its two ends, shape (K,).
 
-        A lost sample (no finite number) is left out; nan where nothing is known of an interval.
+        A lost sample (no finite number) is left out; nan where nothing is known of an interval. Where the true output of a simulation is
+        no finite number, nothing was lost: the limit is not kept, and the interval is not known.
         """
         start, end = self.excess_at_ends(episode)
-        return np.asarray(np.fmax(start, end), dtype=np.float64)
+        worse = np.fmax(start, end)
+        if episode.true_start is not None and not np.isfinite(np.sum(episode.signal(self.signal, true=True))):
+            invalid = ~np.all(np.isfinite(episode.signal(self.signal, true=True)), axis=0)
+            worse = np.where(invalid, np.nan, worse)
+        return np.asarray(worse, dtype=np.float64)
 
     def excess_at_ends(self, episode: Episode) -> NDArray[np.float64]:
         """The excess at both ends of each interval, shape (2, K); nan where it is not known."""

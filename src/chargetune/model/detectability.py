@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from chargetune.model.model import Model
 
-__all__ = ["check_setpoint", "undetectable"]
+__all__ = ["Unseen", "check_setpoint", "undetectable", "unseen"]
 
 # A singular value below this share of the largest is zero: derivatives are exact, and rounding is 1e-16.
 RANK = 1e-9
@@ -18,6 +19,20 @@ RANK = 1e-9
 SHARE = 0.05
 # A direction of which less than this is left at the end of an episode dies out by itself.
 DECAYED = 0.9
+# Growth of a deviation in an unstable model up to which others beside it are not lost in rounding.
+GROWTH = 1e6
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """A direction that the measurements do not see: the states that take part in it, and what it moved them by.
+
+    seen (K,): along an episode, up to each interval, the root of the summed squares of what one ``scale`` of it moved the measured
+    outputs by, in their unit or in their noise; at a set-point it is empty.
+    """
+
+    states: tuple[str, ...]
+    seen: NDArray[np.float64]
 
 
 def undetectable(
@@ -44,7 +59,28 @@ def undetectable(
     with A = df/dx and C = dh/dx, unless Phi_K v has died out. ``known`` states are not estimated. ``scale``: a typical size of a state,
     1 where none is given; a singular value below ``rank`` times the largest counts as zero.
 
-    Raises ValueError for unknown names and shapes that do not fit.
+    Raises ValueError for unknown names, shapes that do not fit and derivatives that are not finite.
+    """
+    return [group.states for group in unseen(model, measured, states, inputs, known=known, scale=scale, rank=rank)]
+
+
+def unseen(
+    model: Model,
+    measured: Sequence[str],
+    states: ArrayLike,
+    inputs: ArrayLike,
+    *,
+    known: Sequence[str] = (),
+    scale: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
+    parameters: ArrayLike | None = None,
+    rank: float = RANK,
+) -> list[Unseen]:
+    """`undetectable` with what each direction moves, and what is unseen in practice.
+
+    ``noise``: standard deviations of the measured outputs. A direction then counts as unseen as well where one ``scale`` of it moves
+    all measurements together by less than one of those: what is known beforehand is worth more than all that is measured.
+    ``parameters``: p of each interval, (K, np), or one for all; None: the model's.
     """
     for field, names, allowed in (("measured", measured, model.output_names), ("known", known, model.state_names)):
         unknown = [name for name in names if name not in allowed]
@@ -55,31 +91,52 @@ def undetectable(
     if x.ndim != u.ndim or x.ndim not in (1, 2) or x.shape[-1] != nx or u.shape[-1] != nu or x.shape[:-1] != u.shape[:-1]:
         raise ValueError(f"detectability of {model.name}: states {x.shape} and inputs {u.shape}, allowed are (K, {nx}) and (K, {nu})")
     free = [i for i, name in enumerate(model.state_names) if name not in known]
+    if not free:
+        return []
     names = [model.state_names[i] for i in free]
     sizes = np.array([float((scale or {}).get(name, 1.0)) for name in names])
     rows = [model.output_names.index(name) for name in measured]
+    units = np.array([float((noise or {}).get(name, 1.0)) for name in measured])
+    p = np.broadcast_to(model.nominal if parameters is None else np.asarray(parameters, dtype=float), (*x.shape[:-1], model.nominal.size))
     slopes = _slopes(model)
     # A known state has no error, whatever the others do to it.
     places = np.ix_(free, free)
 
-    def derivatives(at: NDArray[np.float64], push: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        a, c = (np.array(value) for value in slopes(at, push, model.nominal))
-        return a[places] * sizes / sizes[:, None], c[np.ix_(rows, free)] * sizes
+    def derivatives(*at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        a, c = (np.array(value) for value in slopes(*at))
+        a, c = a[places] * sizes / sizes[:, None], c[np.ix_(rows, free)] * sizes / units[:, None]
+        if not (np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
+            raise ValueError(
+                f"detectability of {model.name}: the derivatives at states {list(at[0])} and inputs {list(at[1])} are not finite"
+            )
+        return a, c
 
     if x.ndim == 1:
-        a, c = derivatives(x, u)
-        return _groups(_null(np.vstack([a - np.eye(len(free)), c]), rank), names)
-    moved, seen = np.eye(len(free)), []
-    for at, push in zip(x, u, strict=True):
-        a, c = derivatives(at, push)
+        a, c = derivatives(x, u, p)
+        return [Unseen(_names(v, names), np.empty(0)) for v in _echelon(_null(np.vstack([a - np.eye(len(free)), c]), rank))]
+    moved, seen, largest = np.eye(len(free)), [], 0.0
+    left: NDArray[np.float64] | None = None
+    for at in zip(x, u, p, strict=True):
+        a, c = derivatives(*at)
         seen.append(c @ moved)
-        moved = a @ moved
-    null = _null(np.vstack(seen) if rows else np.zeros((1, len(free))), rank)
+        ahead = a @ moved
+        largest = largest or GROWTH * max(1.0, float(np.linalg.norm(ahead)))
+        if np.linalg.norm(ahead) > largest:
+            # What grows for ever must not hide the rest: rows may be scaled, and what has died out is judged before that.
+            left = moved if left is None else left
+            ahead *= largest / np.linalg.norm(ahead)
+        moved = ahead
+    stacked = np.vstack(seen) if rows else np.zeros((1, len(free)))
+    null = _null(stacked, rank, 0.0 if noise is None else 1.0)
     if null.size:
         # Of what is not seen, only what does not die out by itself.
-        _, left, directions = np.linalg.svd(moved @ null)
-        null = null @ directions[left > DECAYED].T if left.size else null
-    return _groups(null, names)
+        _, lasting, directions = np.linalg.svd((moved if left is None else left) @ null)
+        null = null @ directions[: lasting.size][lasting > DECAYED].T
+    found = []
+    for v in _echelon(null):
+        each = np.array([float(np.sum((c @ v) ** 2)) for c in seen]) / float(v @ v)
+        found.append(Unseen(_names(v, names), np.sqrt(np.cumsum(each))))
+    return found
 
 
 def check_setpoint(model: Model, measured: Sequence[str], setpoint: Mapping[str, float]) -> None:
@@ -104,23 +161,29 @@ def _slopes(model: Model) -> ca.Function:
     return ca.Function("slopes", [x, u, p], [ca.densify(ca.jacobian(model.f(x, u, p), x)), ca.densify(ca.jacobian(model.h(x, u, p), x))])
 
 
-def _null(matrix: NDArray[np.float64], rank: float) -> NDArray[np.float64]:
-    """An orthonormal basis of what the matrix maps to zero, shape (n, k)."""
+def _null(matrix: NDArray[np.float64], rank: float, least: float = 0.0) -> NDArray[np.float64]:
+    """An orthonormal basis of what the matrix maps to zero, or to less than ``least``, shape (n, k)."""
     _, values, directions = np.linalg.svd(matrix)
     padded = np.zeros(matrix.shape[1])
     padded[: values.size] = values
-    return np.asarray(directions[padded <= rank * max(float(padded[0]), np.finfo(float).tiny)].T, dtype=np.float64)
+    small = padded <= max(rank * max(float(padded[0]), np.finfo(float).tiny), least)
+    return np.asarray(directions[small].T, dtype=np.float64)
 
 
-def _groups(null: NDArray[np.float64], names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Which names take part in each direction; a basis in echelon form, so that no direction has more of them than it needs."""
+def _echelon(null: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The basis in echelon form, so that no direction has more entries than it needs."""
     vectors = [np.array(column) for column in null.T]
     reduced: list[NDArray[np.float64]] = []
     while vectors:
         # The entry that is largest over all that is left becomes that direction's own.
-        k, i = np.unravel_index(int(np.argmax(np.abs(vectors))), (len(vectors), len(names)))
+        k, i = np.unravel_index(int(np.argmax(np.abs(vectors))), (len(vectors), vectors[0].size))
         own = vectors.pop(int(k))
         own = own / own[i]
         vectors = [v - v[i] * own for v in vectors]
         reduced = [v - v[i] * own for v in reduced] + [own]
-    return [tuple(n for n, v in zip(names, vector, strict=True) if abs(v) > SHARE * np.max(np.abs(vector))) for vector in reduced]
+    return reduced
+
+
+def _names(vector: NDArray[np.float64], names: Sequence[str]) -> tuple[str, ...]:
+    """The states that take part in a direction."""
+    return tuple(n for n, v in zip(names, vector, strict=True) if abs(v) > SHARE * np.max(np.abs(vector)))

@@ -121,17 +121,24 @@ class ParameterSpace:
             # A rounding error of the unit-cube transform is not a wrong theta.
             slack = 1e-9 * (high - low)
             if not math.isfinite(value) or not low - slack <= value <= high + slack:
-                raise ValueError(f"theta: {name} = {value:g}, allowed is [{low:g}, {high:g}] {unit}")
+                raise ValueError(f"theta: {name} = {value:g}, allowed is [{low:g}, {high:g}] {'' if unit == '1' else unit}".rstrip())
         return np.asarray(np.clip(values, self.lower, self.upper), dtype=np.float64)
 
     def from_dict(self, values: dict[str, float | Sequence[float]]) -> NDArray[np.float64]:
         """theta from named values (a parameter or a single entry); what is not named stays at its default."""
         theta, slices, entries = self.default, self.slices, self.entries
         for name, value in values.items():
+            given = _numbers(name, value)
             if name in slices:
-                theta[slices[name]] = value
+                size = theta[slices[name]].size
+                if given.shape not in ((), (1,), (size,)):
+                    allowed = f"one or {size} numbers" if size > 1 else "one number"
+                    raise ValueError(f"theta: {name} has {given.size} values, allowed is {allowed}")
+                theta[slices[name]] = given
             elif name in entries:
-                theta[entries.index(name)] = float(np.asarray(value))
+                if given.size != 1:
+                    raise ValueError(f"theta: {name} has {given.size} values, allowed is one number")
+                theta[entries.index(name)] = given.item()
             else:
                 raise ValueError(f"theta: unknown name {name!r}, allowed are {', '.join(slices) or '(none)'}")
         return self.validate(theta)
@@ -161,3 +168,10 @@ class ParameterSpace:
             np.where(log, np.log(np.where(log, low, 1.0)), low),
             np.where(log, np.log(np.where(log, high, 1.0)), high),
         )
+
+
+def _numbers(name: str, value: object) -> NDArray[np.float64]:
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"theta: {name} = {value!r}, allowed is a number or a list of numbers") from None

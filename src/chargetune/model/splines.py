@@ -19,7 +19,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
 __all__ = ["natural_spline", "natural_spline_matrix", "pchip", "piecewise_linear"]
 
@@ -30,6 +29,8 @@ def natural_spline_matrix(nodes: ArrayLike) -> NDArray[np.float64]:
     if z.size == 2:
         slope = np.array([-1.0, 1.0]) / (z[1] - z[0])
         return np.vstack([[1.0, 0.0], slope, np.zeros((2, 2))])
+    from scipy.interpolate import CubicSpline
+
     spline = CubicSpline(z, np.eye(z.size), bc_type="natural")
     cubic = spline.c[0]
     jumps = np.diff(np.vstack([np.zeros((1, z.size)), cubic, np.zeros((1, z.size))]), axis=0)
@@ -79,6 +80,8 @@ def pchip(z: Any, nodes: ArrayLike, values: ArrayLike) -> Any:
     grid, table = _check_nodes(nodes), np.asarray(values, dtype=float)
     if table.shape != grid.shape or not np.all(np.isfinite(table)):
         raise ValueError(f"spline values have shape {table.shape}, expected {grid.shape} finite numbers")
+    from scipy.interpolate import PchipInterpolator
+
     interpolant = PchipInterpolator(grid, table)
     slope = interpolant.derivative()(grid)
     curve = np.append(interpolant.c[1], 0.0)

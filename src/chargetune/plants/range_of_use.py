@@ -55,6 +55,9 @@ class RangeOfUse:
                 unknown = sorted(set(getattr(one, label)) - set(known))
                 if unknown:
                     raise ValueError(f"range: variation {one.name}: {label} names unknown {unknown}, allowed are {', '.join(known)}")
+            followed = sorted(set(one.parameters) & set(self.plant.given))
+            if followed:
+                raise ValueError(f"range: variation {one.name}: parameters names {followed}, allowed are none that follow a given signal")
         unknown = sorted(set(self.start_bounds) - set(model.state_names))
         if unknown:
             raise ValueError(f"range: start_bounds names unknown {unknown}, allowed are {', '.join(model.state_names)}")
@@ -101,7 +104,7 @@ class RangeOfUse:
                 bias[name] = bias.get(name, 0.0) + sensitivity * float(values[0])
         for name, (low, high) in self.start_bounds.items():
             start[name] = float(np.clip(start[name], low, high))
-        plant = SimulatedPlant(model.with_parameters(**parameters), start, replace(sensors, bias=bias), self.plant.process_noise_sd)
+        plant = replace(self.plant, model=model.with_parameters(**parameters), start=start, sensors=replace(sensors, bias=bias))
         return DrawnPlant(plant, seed, drawn)
 
 

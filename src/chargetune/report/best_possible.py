@@ -13,10 +13,10 @@ __all__ = ["best_possible"]
 def best_possible(view: StudyView) -> float | None:
     """The loss of the plant oracle, in what the tuner makes small; None where it is not known.
 
-    It is found where the plant is the cell's own circuit, on which it takes about a second. An electrochemical plant would take
+    It is found where the plant is a circuit, on which it takes about a second. An electrochemical plant would take
     minutes; on the drawn plants of a range of use there is one for each.
     """
-    if view.problem is None or view.problem.plant is not None or view.over_range:
+    if view.problem is None or view.problem.plant_cell is None or view.over_range:
         return None
     return _loss(judged_exactly(view.problem), by_performance=view.tuner == "ei")
 

@@ -73,7 +73,7 @@ class StudyView:
     def untuned(self) -> Trial | None:
         """The first trial of theta_0, which a tuner asks for first."""
         default = self.space.default
-        return next((t for t in self.trials if np.array_equal(t.theta, default)), None)
+        return next((t for t in self.trials if t.status is not TrialStatus.APART and np.array_equal(t.theta, default)), None)
 
     @property
     def start(self) -> Trial | None:
@@ -120,7 +120,7 @@ class StudyView:
     def others(self) -> tuple[Trial, ...]:
         """Told trials that are neither the start nor the tuned one, the failed ones included."""
         apart = [t.number for t in (self.start, self.tuned) if t is not None]
-        return tuple(t for t in self.trials if t.status is not TrialStatus.RUNNING and t.number not in apart)
+        return tuple(t for t in self.trials if t.status in (TrialStatus.DONE, TrialStatus.FAILED) and t.number not in apart)
 
     def episodes(self, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Episode]]:
         """Those of ``trials`` that have a trace, each with its episode, read one at a time.

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from chargetune.model.parameter_space import ParameterSpace
+from chargetune.study.names import check_name
 from chargetune.study.serialization import canonical_json, describe, differences, space_to_json
 from chargetune.study.store.rows import StudyRecord
 
 __all__ = ["StudyError", "check_change", "parameters_of", "study_identity"]
 
-NAME = re.compile(r"[^\W_](?:[\w .,+=:@()-]{0,98}[\w.,+=:@()-])?")
 SHOWN = 12
 
 
@@ -33,10 +32,7 @@ def study_identity(
     earlier: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The identity as JSON data. Raises ValueError naming the argument, its value and what is allowed."""
-    if not NAME.fullmatch(name):
-        raise ValueError(
-            f"study name = {name!r}, allowed are 1 to 100 letters, digits, spaces and _ . , + = : @ ( ) -, first a letter or digit"
-        )
+    check_name(name)
     for field, value, least in (("seed", seed, 0), ("batch", batch, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{field} = {value!r}, allowed is an integer >= {least}")

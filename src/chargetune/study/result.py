@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
 from chargetune.episode.score import Score, in_tolerances
-from chargetune.study.serialization import canonical_json, sha256
+from chargetune.study.changes import change_note, inside
+from chargetune.study.serialization import canonical_json, sha256, space_from_json
 from chargetune.study.store.rows import StudyRecord
 from chargetune.study.store.store import Store
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 
-__all__ = ["Reason", "StudyResult", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]
+__all__ = ["Reason", "StudyResult", "allowed", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]
 
 
 class Reason(StrEnum):
@@ -42,18 +43,20 @@ class StudyResult:
     """The trial that is the result of a study, None only where no trial has a score.
 
     ``asked`` says whether the tuner had its say on exactly these trials. Where it is False the verdicts measured alone decide: the
-    study is running, was interrupted, is of an older program, or only some of its trials are looked at.
+    study is running, was interrupted, is of an older program, or only some of its trials are looked at. ``note`` says which trials
+    are set apart or were judged again since the study was changed.
     """
 
     trial: Trial | None
     reason: Reason
     asked: bool = True
+    note: str = ""
 
     @property
     def sentence(self) -> str:
         """Why, for people: one clause without a capital and a stop."""
         aside = "" if self.asked else " (by the verdicts alone; the tuner was not asked about these trials)"
-        return SENTENCES[self.reason] + aside
+        return SENTENCES[self.reason] + aside + (f"; {self.note}" if self.note else "")
 
     @property
     def kept(self) -> Trial | None:
@@ -112,12 +115,22 @@ def read_result(store: Store, record: StudyRecord, trials: Sequence[Trial] | Non
     none is stored, it is what was measured, with ``asked`` False.
     """
     trials = store.trials(record.id) if trials is None else trials
+    return replace(_read(store, record, trials), note=change_note(trials))
+
+
+def _read(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyResult:
     stored = store.result(record.id)
     if stored is not None and stored.made_from == made_from(record, trials):
         trial = next((t for t in trials if t.number == stored.number), None)
         if (trial is None) == (stored.number is None) and stored.reason in set(Reason):
             return StudyResult(trial, Reason(stored.reason))
-    return measured_result(trials, by_performance=by_performance(record.identity), asked=False)
+    return measured_result(allowed(record, trials), by_performance=by_performance(record.identity), asked=False)
+
+
+def allowed(record: StudyRecord, trials: Sequence[Trial]) -> list[Trial]:
+    """The trials that the study as it is now could have asked for: none that is set apart, and none outside its bounds."""
+    space = space_from_json(record.identity.get("space", []))
+    return [t for t in trials if t.status is not TrialStatus.APART and (not space.dimension or inside(space, t.theta))]
 
 
 def _clearly_kept(score: Score) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
@@ -19,13 +20,14 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.runtime.interrupts import raise_lost_interrupt
+from chargetune.study.changes import Carry, carried_over
 from chargetune.study.dataframe import study_html, trials_dataframe
 from chargetune.study.evaluation import Evaluate, trial_seed
-from chargetune.study.executors import process_executor
+from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.result import StudyResult, by_performance, made_from, read_result, with_belief
+from chargetune.study.result import StudyResult, allowed, by_performance, made_from, read_result, with_belief
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
 from chargetune.study.serialization import canonical_json, score_to_json, sha256
@@ -85,6 +87,7 @@ class Study:
         hardware: bool = False,
         earlier: Sequence[Earlier] = (),
         accept_changed: bool = False,
+        carry: Carry | None = None,
     ) -> Self:
         """The study ``name`` of the store, begun if there is none.
 
@@ -96,8 +99,11 @@ class Study:
             Studies whose told trials are its initial data D_0: the tuner gets them before its own. They are copied when the study is
             begun, with traces and origin, and keep numbers below 0; `trials` and `best` leave them out.
         accept_changed
-            Resume although something differs. The old trials stay as they are; the parameters must keep names, order and units, and
-            ``earlier`` must be what it was.
+            Resume although something differs; the parameters must keep names, order and units, and ``earlier`` must be what it was.
+            Old trials outside of the bounds are set apart, see `carried_over`; back in them they count again.
+        carry
+            What is known of the configuration: old trials of another closed loop are then set apart, too, and judged again from
+            their traces where only the verdict changes. None: the old trials stay as they are.
 
         Raises ValueError for bad arguments; StudyError when what is resumed differs, or when another process holds the study.
         """
@@ -110,7 +116,7 @@ class Study:
         try:
             record = store.study(name)
             if check_change(record, identity, accept_changed=accept_changed):
-                store.change_study(record.id, identity)
+                store.change_study(record.id, identity, _carried(store, record, identity, space, carry))
                 record = store.study(name)
             term = store.note_holder(record.id, os.getpid(), socket.gethostname())
         except BaseException:
@@ -138,11 +144,11 @@ class Study:
 
     def best(self) -> Trial | None:
         """The trial of the largest objective that was measured to keep every limit; the `result` may be another."""
-        return best_feasible(self.trials())
+        return best_feasible(allowed(self.record, self.trials()))
 
     def best_performance(self) -> Trial | None:
         """The trial of the largest performance G, the incumbent of the paper's Algorithm 1."""
-        return best_performance(self.trials())
+        return best_performance(allowed(self.record, self.trials()))
 
     def result(self) -> StudyResult:
         """The result of the study as it stands, and why: the one that every command and page shows.
@@ -157,11 +163,12 @@ class Study:
         if known.asked:
             return known
         own = by_performance(self.record.identity)
-        found = with_belief(trials, lambda: self._believed_best(trials), by_performance=own)
+        count = allowed(self.record, trials)
+        found = with_belief(count, lambda: self._believed_best(count), by_performance=own)
         number = None if found.trial is None else found.trial.number
         made = ResultRecord(number, found.reason.value, made_from(self.record, trials))
         self.store.set_result(self.record.id, made, term=self.term)
-        return found
+        return replace(found, note=known.note)
 
     def _believed_best(self, trials: Sequence[Trial]) -> Trial | None:
         """The trial that the tuner believes best from all traces; None where it does not say, or names one of an earlier study."""
@@ -261,7 +268,8 @@ class Study:
             None: batch after batch, each when the one before it is told; the trials depend on nothing but the study. A number:
             so many trials are under way at once, and as soon as one is told the next theta is proposed, with those under way as
             pending points. One worker gives the trials of a study in batches of 1; with more they depend on the order in which
-            evaluations end. Each trial's provenance says which were ``pending`` when it was proposed.
+            evaluations end. Each trial's provenance says which were ``pending`` when it was proposed. Without an executor there are
+            not more than cores of this machine and trials left; a larger number is lowered with a warning.
         attempts
             A trial whose worker was lost is evaluated again until so many workers were lost by it; then it has failed. Losses are
             counted in the store. With 1, and always on hardware, nothing is repeated: a trial that was begun and is not told stops
@@ -297,10 +305,14 @@ class Study:
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} = {value!r}, allowed is an integer >= 1")
         with ExitStack() as stack:
+            known = self.trials()
             if executor is None and workers is not None:
+                told = sum(t.status is not TrialStatus.RUNNING for t in known)
+                workers, said = bounded_workers(workers, max(1, trials - told))
+                if said:
+                    warnings.warn(said, RuntimeWarning, stacklevel=2)
                 executor = stack.enter_context(process_executor(workers))
             check_crosses(evaluate, executor)
-            known = self.trials()
             if isinstance(progress, bool):
                 progress = stack.enter_context(progress_bar(known, trials)) if progress else None
             tally = Tally(known, progress)
@@ -352,8 +364,8 @@ class Study:
         return [tuple(float(v) for v in self.space.validate(theta)) for theta in thetas]
 
     def _traced(self, trials: Sequence[Trial]) -> list[Trial]:
-        """Earlier studies' trials and these, each with a reader of its episode where it has a trace."""
-        known = [*self.earlier, *trials]
+        """Earlier studies' trials and those of these that count, each with a reader of its episode where it has a trace."""
+        known = [*self.earlier, *allowed(self.record, trials)]
         return [t if t.trace_sha256 is None else replace(t, episode=partial(self.episode, t.number)) for t in known]
 
     def episode(self, number: int) -> Episode | None:
@@ -367,7 +379,7 @@ class Study:
 
     def _record(self, first: int, thetas: Sequence[tuple[float, ...]], known: Sequence[Trial], **more: Any) -> list[Trial]:
         # A tuner, and the twin in it, is a pure function of the trials it was given, so these are its whole state.
-        state = [[t.number, list(t.theta), *result_of(t)] for t in (*self.earlier, *known)]
+        state = [[t.number, list(t.theta), *result_of(t)] for t in (*self.earlier, *allowed(self.record, known))]
         made_with = {**self._provenance(), "learnt_sha256": sha256(canonical_json(state, "trials")), **more}
         now = utc_now()
         trials = [
@@ -381,9 +393,20 @@ class Study:
         return {"study_sha256": self.record.identity_sha256, "versions": versions()}
 
 
+def _carried(store: Store, record: StudyRecord, identity: Mapping[str, Any], space: ParameterSpace, carry: Carry | None) -> list[Trial]:
+    def episode(number: int) -> Episode | None:
+        trace = store.trace(record.id, number)
+        return None if trace is None else Episode.from_arrays(*trace)
+
+    new_sha256 = sha256(canonical_json(identity, "study"))
+    return carried_over(
+        store.trials(record.id), old=record.identity, new=identity, new_sha256=new_sha256, space=space, carry=carry, episode=episode
+    )
+
+
 def _refuse_sameness(trials: Sequence[Trial]) -> None:
     """StudyError when the first trials failed, as many as there are, and all for the same reason."""
-    told = [t for t in trials if t.status is not TrialStatus.RUNNING]
+    told = [t for t in trials if t.status in (TrialStatus.DONE, TrialStatus.FAILED)]
     # A loop that was ended at a limit says something of its theta.
     failed = all(t.score is None and not (t.ending or "").startswith(Ending.LIMIT.value) for t in told)
     if failed and len(told) == SAME_FAILURES and len({t.ending for t in told}) == 1:

@@ -14,11 +14,15 @@ __all__ = ["Trial", "TrialStatus", "best_feasible", "best_performance"]
 
 
 class TrialStatus(StrEnum):
-    """Where a trial stands. ``running`` means asked and not yet told, whether a process works on it or not."""
+    """Where a trial stands. ``running`` means asked and not yet told, whether a process works on it or not.
+
+    ``apart``: it was told before the study was changed, and is not comparable with what the study is now; its ending says why.
+    """
 
     RUNNING = "running"
     DONE = "done"
     FAILED = "failed"
+    APART = "apart"
 
 
 @dataclass(frozen=True)

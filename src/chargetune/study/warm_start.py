@@ -44,7 +44,7 @@ def read_earlier(earlier: Sequence[Earlier], space: ParameterSpace) -> list[tupl
             if old != new:
                 raise StudyError(f"{store.label}: the earlier study {one.study!r} tunes {', '.join(old)}, allowed is {', '.join(new)}")
             for trial in store.trials(record.id):
-                if trial.status is TrialStatus.RUNNING:
+                if trial.status in (TrialStatus.RUNNING, TrialStatus.APART):
                     continue
                 try:
                     space.validate(trial.theta)

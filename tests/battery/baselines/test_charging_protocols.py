@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, attia_fourth_rate, charge, constant_current, four_step, multi_step
-from chargetune.battery.baselines.comparison import compare, row_names
+from chargetune.battery.baselines.comparison import CCCV, compare, row_names
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
-from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.cell.thermal import Thermal
+from chargetune.battery.charging.evaluate import plant_of, run_charge
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.charging.metrics import crossing_minutes
 from chargetune.battery.charging.tunables import ResistanceRatio
@@ -116,3 +117,25 @@ def test_the_table_of_the_circuit():
     for name in ("CC-CV 1.5 A", "CC-CV 3 A", "CC-CV 6 A", "multi-step CC", "four-step CC (Attia)"):
         assert not rows[name].breaks_limit, name
     assert rows["CC-CV 6 A"].score.metrics["t80_min"] == pytest.approx(oracle.score.metrics["t80_min"], abs=1e-6)
+    # With the voltage as the only limit the fastest rate is the largest.
+    assert rows[CCCV].setting == "6 A"
+    assert rows[CCCV].score.metrics == rows["CC-CV 6 A"].score.metrics
+
+
+def test_the_fastest_rate_that_keeps_the_temperature_is_found():
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05))
+    problem = charging_problem(warm, mismatch_seed=None, horizon=3, steps=240, temperature_max_K=306.0)
+    (row,) = compare(problem, rows=[CCCV])
+    rate = float(row.setting.removesuffix(" A"))
+    assert not row.breaks_limit
+    # A step of the search faster and it is too hot.
+    stepped, largest = as_steppable(plant_of(problem)), problem.current_max_A
+    law = constant_current(rate + largest / 64)
+    faster = charge(stepped, law, [VOLTAGE], steps=240, soc_target=problem.episode.soc_target, current_max_A=largest)
+    assert max(values.max() for values in faster.signal("temperature_K")) > 306.0 + problem.limits.tolerance_K
+
+
+def test_a_row_that_does_not_exist_is_refused():
+    problem = charging_problem(CELL)
+    with pytest.raises(ValueError, match=r"--row 'CC-CV 7 A', allowed are 'CC-CV 1\.5 A', "):
+        list(compare(problem, rows=["CC-CV 7 A"]))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chargetune.battery.baselines.comparison import smallest_that_keeps
+from chargetune.battery.baselines.comparison import CCCV, smallest_that_keeps
 from chargetune.battery.baselines.range_comparison import ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.thermal import Thermal
@@ -49,15 +49,15 @@ def test_the_controller_without_a_margin_breaks_the_limit_and_the_smallest_backo
     assert rows["tuned"].violations == 0
     assert rows["tuned"].mean("t80_min") > best.mean("t80_min")
     # CC-CV reads the voltage of each plant: without another limit its largest rate keeps it.
-    assert rows["CC-CV"].setting == "6 A"
-    assert rows["CC-CV"].mean("t80_min") == pytest.approx(rows[ORACLE].mean("t80_min"), rel=1e-9)
+    assert rows[CCCV].setting == "6 A"
+    assert rows[CCCV].mean("t80_min") == pytest.approx(rows[ORACLE].mean("t80_min"), rel=1e-9)
 
 
 def test_the_fastest_rate_is_that_of_the_hottest_plant():
     warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05))
     problem = charging_problem(warm, mismatch_seed=None, horizon=3, steps=150, temperature_max_K=306.0, backoff=Backoff(nodes=2))
     problem = replace(problem, range=ChargingRangeSettings(soc_start=(0.3, 0.5), resistance=0.2))
-    row = next(row for row in compare_range(problem, draws=4) if row.name == "CC-CV")
+    row = next(row for row in compare_range(problem, draws=4) if row.name == CCCV)
     rate = float(row.setting.removesuffix(" A"))
     assert row.violations == 0
     assert 0.3 < rate < 5.9

@@ -44,8 +44,11 @@ REFUSED = [
     ("soc", changed(NINE, 2, NAN), ("soc[2] = nan", "finite")),
     ("soc", changed(NINE, 2, "0,3"), ("soc[2] = '0,3'", "finite number")),
     # Open-circuit voltage
-    ("ocv_V", changed(CELL.ocv_V, 4, CELL.ocv_V[3]), ("ocv_V[4] = 3.3182 must be more than ocv_V[3] = 3.3182", "increases with SOC")),
-    ("ocv_V", changed(CELL.ocv_V, 5, 3.0), ("ocv_V[5] = 3 must be more than ocv_V[4] = 3.4193",)),
+    ("ocv_V", changed(CELL.ocv_V, 5, 3.0), ("ocv_V[5] = 3 must not be less than ocv_V[4] = 3.4193", "increases with SOC")),
+    ("ocv_V", tuple(v - 0.25 for v in CELL.ocv_V), ("voltage_max_V = 4.2, allowed is at most 4.15 V, 0.2 V above",)),
+    ("ocv_V", (3.7,) * 10, ("ocv_V[7] = 3.7 is the same from SOC 0 to 0.8392", "0.5 of the SOC")),
+    ("ocv_V", (3.7,) * 5 + (3.75,) * 5, ("ocv_V[7] = 3.75 is the same from SOC 0.2915 to 0.8392",)),
+    ("ocv_V", tuple(3.7 + 0.001 * i for i in range(10)), ("ocv_V[-1] = 3.709, allowed is at least 0.05 V above ocv_V[0] = 3.7",)),
     ("ocv_V", CELL.ocv_V[:9], ("ocv_V has 9 values, expected 10",)),
     ("ocv_V", changed(CELL.ocv_V, 1, INF), ("ocv_V[1] = inf", "finite")),
     ("ocv_V", changed(CELL.ocv_V, 1, YES), ("ocv_V[1] = True", "finite number")),
@@ -63,24 +66,24 @@ REFUSED = [
     ("capacity_Ah", INF, ("capacity_Ah = inf", "finite")),
     ("capacity_Ah", "2,0", ("capacity_Ah = '2,0'", "finite number")),
     ("capacity_Ah", True, ("capacity_Ah = True", "finite number")),
-    ("capacity_Ah", 2000.0, ("capacity_Ah = 2000", "at most 1000 Ah", "mAh?")),
+    ("capacity_Ah", 2000.0, ("capacity_Ah = 2000", "at most 1500 Ah", "mAh?")),
     ("capacity_Ah", 800.0, ("current_max_A = 6", "capacity_Ah = 800", "mAh?")),
     ("coulombic_efficiency", 0.0, ("coulombic_efficiency = 0", "more than 0.5 and at most 1")),
     ("coulombic_efficiency", 99.9, ("coulombic_efficiency = 99.9", "at most 1")),
     # Resistances and capacitance
     ("R0_ohm", changed(CELL.R0_ohm, 2, 0.0), ("R0_ohm[2] = 0", "more than 0")),
     ("R0_ohm", changed(CELL.R0_ohm, 2, -0.06), ("R0_ohm[2] = -0.06", "more than 0")),
-    ("R1_ohm", tuple(1000 * r for r in CELL.R1_ohm), ("R1_ohm[0] = 39.2", "at most 1 ohm", "milliohm?")),
-    ("R0_ohm", tuple(1000 * r for r in CELL.R0_ohm), ("R0_ohm[0] = 62.9", "at most 1 ohm", "milliohm?")),
+    ("R1_ohm", tuple(1000 * r for r in CELL.R1_ohm), ("R1_ohm[0] = 39.2", "at most 1 ohm, 2 V at 1C", "milliohm?")),
+    ("R0_ohm", tuple(1000 * r for r in CELL.R0_ohm), ("R0_ohm[0] = 62.9", "at most 1 ohm, 2 V at 1C", "milliohm?")),
     ("R1_ohm", changed(CELL.R1_ohm, 0, NAN), ("R1_ohm[0] = nan", "finite")),
     ("R1_ohm", CELL.R1_ohm[:8], ("R1_ohm has 8 values, expected 9",)),
     ("C1_F", changed(CELL.C1_F, 8, 0.0), ("C1_F[8] = 0", "more than 0")),
     ("C1_F", changed(CELL.C1_F, 8, -1.0), ("C1_F[8] = -1", "more than 0")),
-    ("C1_F", changed(CELL.C1_F, 8, 1e9), ("C1_F[8] = 1e+09", "at most 1e+07 F")),
+    ("C1_F", changed(CELL.C1_F, 8, 1e9), ("C1_F[8] = 1e+09", "R1_ohm[8] x C1_F[8] = 1.98e+07 s", "0.001 to 100000 s")),
     # Limits
     ("voltage_max_V", 2.5, ("voltage_max_V = 2.5 must be more than voltage_min_V = 2.5",)),
     ("voltage_max_V", 2.0, ("voltage_max_V = 2 must be more than voltage_min_V = 2.5",)),
-    ("voltage_max_V", 4.35, ("voltage_max_V = 4.35", "at most 4.3 V", "above the OCV of the full cell")),
+    ("voltage_max_V", 4.45, ("voltage_max_V = 4.45", "at most 4.4 V, 0.2 V", "above the OCV of the full cell")),
     ("voltage_max_V", 4200.0, ("voltage_max_V = 4200", "at most 5 V", "mV?")),
     ("voltage_min_V", 2500.0, ("voltage_min_V = 2500", "at most 5 V", "mV?")),
     ("voltage_min_V", -2.5, ("voltage_min_V = -2.5", "more than 0.5")),
@@ -101,7 +104,7 @@ def test_refuses(cell, name, value, said):
 
 
 def test_limits_at_the_edge_are_accepted(cell):
-    assert replace(cell, voltage_max_V=4.3, current_max_A=200.0, coulombic_efficiency=0.99).voltage_max_V == 4.3
+    assert replace(cell, voltage_max_V=4.4, current_max_A=200.0, coulombic_efficiency=0.99).voltage_max_V == 4.4
     assert replace(cell, current_max_A=0.02).current_max_A == 0.02
 
 

@@ -15,7 +15,7 @@ from chargetune.battery.charging.metrics import charging_metrics
 from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.ringing import check_ringing
 from chargetune.battery.charging.settings import EstimatorSettings
-from chargetune.battery.charging.tunables import ObserverSetting
+from chargetune.battery.charging.tunables import CurrentRamp, ObserverSetting
 from chargetune.battery.studies.study_file import load_config
 from chargetune.control.riccati import steady_filter
 from chargetune.episode.stepwise import run_episode
@@ -118,6 +118,23 @@ def test_a_ramp_limits_how_fast_the_current_rises():
     assert free[0] == pytest.approx(CELL.current_max_A, abs=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["open_loop", "exact", "kalman"])
+def test_every_other_kind_has_the_ramp_as_well(kind):
+    ramped = run_charge(problem(kind, 0, steps=10, current_ramp_A_s=0.1))
+    assert len(ramped) == 10
+    np.testing.assert_allclose(ramped.input[:5, 0], np.arange(1.0, 6.0), atol=1e-3)
+
+
+def test_theta_may_be_the_ramp():
+    own = problem("offset_free", 0, steps=40, current_ramp_A_s=0.1, current_ramp=CurrentRamp(0.01, 1.0))
+    assert own.space.entries == ("current_ramp_A_s",)
+    assert own.space.default == pytest.approx([0.1])
+    for ramp in (0.02, 0.1):
+        told = problem("offset_free", 0, steps=40, current_ramp_A_s=ramp)
+        np.testing.assert_allclose(run_charge(own, [ramp]).input, run_charge(told).input, atol=1e-6)
+    assert run_charge(own, [0.02]).input[0, 0] == pytest.approx(0.2, abs=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["offset_free", "adaptive"])
 def test_theta_may_be_any_number_of_the_observer(kind):
     values = {"offset_drift_V": 0.02, "voltage_sd_V": 0.004, "backoff_sd": 1.0}
@@ -132,11 +149,11 @@ def test_theta_may_be_any_number_of_the_observer(kind):
 
 def test_the_default_backoff_is_that_of_the_scalar_riccati_equation():
     """Of one integrating disturbance P^2 - q^2 P - q^2 r^2 = 0, the variance of its prediction."""
-    settings = OffsetFree(offset_drift_V=0.004, voltage_sd_V=0.003, resistance_rate=1.5)
+    settings = OffsetFree(offset_drift_V=0.004, voltage_sd_V=0.003, resistance_drift=0.15)
     own = controller_of(problem("offset_free", offset_free=settings))
     resistance = np.mean(np.array(dict(own.model.parameters)["R0_ohm"]) + np.array(dict(own.model.parameters)["R1_ohm"]))
     for current in (0.0, 6.0):
-        drift = resistance * current * 1.5 * (10.0 / 3600 / CELL.capacity_Ah * current)
+        drift = resistance * current * 0.15 * np.sqrt(10.0 / 3600 / CELL.capacity_Ah * current)
         q2, r2 = 0.004**2 * 10 / 60 + drift**2, 0.003**2
         wanted = np.sqrt(q2 / 2 + np.sqrt(q2**2 / 4 + q2 * r2))
         x = np.zeros(len(own.model.states))
@@ -154,6 +171,25 @@ def test_a_charge_tells_apart_what_rest_does_not():
     assert {"resistance_log_factor", "soc", "voltage_V_offset"} <= alike
     episode = run_charge(problem("adaptive", None, steps=200))
     assert undetectable(own.model, ("voltage_V",), episode.estimate[:150], episode.input[:150], scale=scale) == []
+
+
+def test_an_ocv_and_resistances_that_say_nothing_of_the_soc_are_found():
+    """On a straight OCV and constant resistances an offset of the voltage is as an error of the SOC; a flat one hides the SOC."""
+    nodes = len(CELL.soc)
+    tables = {"R0_ohm": (0.02,) * nodes, "R1_ohm": (0.015,) * nodes, "C1_F": (2000.0,) * nodes}
+    straight = replace(CELL, ocv_soc=(0.0, 0.2, 0.6, 1.0), ocv_V=(3.2, 3.39, 3.77, 4.15), **tables)
+    flat = replace(CELL, ocv_soc=(0.0, 0.1, 0.9, 1.0), ocv_V=(3.1, 3.3, 3.302, 3.4), voltage_max_V=3.45, voltage_min_V=2.5, **tables)
+    for cell, kind, words in (
+        (straight, "adaptive", "soc, voltage_V_offset cannot be told apart from voltage_V"),
+        (flat, "kalman", "soc cannot be seen from voltage_V"),
+        (flat, "offset_free", None),
+    ):
+        own = charging_problem(cell, mismatch_seed=None, kind=kind, steps=150, soc_start=0.3, soc_target=0.8)
+        found = [f for f in check_charging(own, quick=True) if f.code == "observer-undetectable"]
+        assert len(found) == (words is not None)
+        if words:
+            assert words in found[0].message
+            assert "(soc 0.3 to" in found[0].message
 
 
 DEADBEAT = OffsetFree(offset_drift_V=0.5, voltage_sd_V=1e-3, backoff_sd=0.0)
@@ -186,13 +222,20 @@ def test_the_check_of_a_problem_tells_of_it():
         (lambda: OffsetFree(voltage_sd_V=0.0), ["offset_free: voltage_sd_V = 0.0"]),
         (lambda: OffsetFree(soc_from_rest=1), ["soc_from_rest = 1", "true or false"]),
         (
-            lambda: problem("offset_free", observer=(ObserverSetting("resistance_drift", 0.1, 1.0),)),
-            ["'resistance_drift'", "offset_drift_V"],
+            lambda: problem("offset_free", observer=(ObserverSetting("resistance_start_sd", 0.1, 1.0),)),
+            ["'resistance_start_sd'", "offset_drift_V"],
         ),
         (lambda: problem("open_loop", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["'voltage_sd_V'", "(none)"]),
         (lambda: problem("offset_free", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["voltage_sd_V = 0.002", "[0.1, 1]"]),
         (lambda: problem("offset_free", observer=(ObserverSetting("backoff_sd", 0.1, 5.0),) * 2), ["backoff_sd", "different names"]),
         (lambda: problem("open_loop", current_ramp_A_s=0.0), ["current_ramp_A_s = 0.0"]),
+        (lambda: problem("open_loop", current_ramp=CurrentRamp(0.01, 1.0)), ["theta.current_ramp", "current_ramp_A_s", "[0.01, 1] A/s"]),
+        (
+            lambda: problem("open_loop", current_ramp_A_s=2.0, current_ramp=CurrentRamp(0.01, 1.0)),
+            ["current_ramp_A_s = 2.0", "[0.01, 1] A/s", "theta.current_ramp"],
+        ),
+        (lambda: CurrentRamp(0.0, 1.0), ["current ramp: lower_A_s = 0.0"]),
+        (lambda: CurrentRamp(0.5, 0.5), ["current ramp: upper_A_s = 0.5"]),
     ],
 )
 def test_refusals(make, words):

@@ -98,7 +98,7 @@ BDF = DIALECTS["BDF"]
 REFUSED = {
     "empty": ("", ("is empty",)),
     "only a header": ("Time(s),Current(A),Voltage(V)\n", ("0 rows of numbers", "at least 2")),
-    "wrong columns": ("a,b,c\n1,2,3\n2,3,4\n", ("no column for time, current, voltage", "a,b,c")),
+    "wrong columns": ("a,b,c\n1,2,3\n2,3,4\n", ("no column for time, current, voltage", "a, b, c")),
     "misspelt column": (BDF.replace("Voltage", "Volatge"), ("no column for voltage", "Volatge")),
     "not a number": (BDF.replace("3.71", "n/a"), ("row 5", "Voltage / V = 'n/a'", "a number")),
     "not finite": (BDF.replace("3.71", "nan"), ("row 5", "'nan'", "finite")),
@@ -107,7 +107,7 @@ REFUSED = {
         ("sample 5", "after 300 s", "increasing"),
     ),
     "time falls a little": (BDF.replace("\n20,", "\n9,"), ("sample 3", "time = 9 s after 10 s", "increasing")),
-    "time stands": ("Time(s),Current(A),Voltage(V)\n" + "5,1,3.6\n" * 20 + "6,0,3.5\n", ("time stands at 5 s",)),
+    "time stands": ("Time(s),Current(A),Voltage(V)\n" + "".join(f"5,1,3.6{k}\n" for k in range(20)) + "6,0,3.5\n", ("time stands at 5 s",)),
     "a gap": (BDF.replace("\n30,", "\n900,").replace("\n40,", "\n910,").replace("\n50,", "\n920,"), ("sample 4", "gap of 880 s", "300 s")),
     "a gap before a current": (
         BDF.replace("\n20,", "\n820,").replace("\n30,", "\n830,").replace("\n40,", "\n840,").replace("\n50,", "\n850,"),

@@ -14,9 +14,10 @@ from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.identification.cycler_files import read_record
+from chargetune.battery.identification.plausibility import checked
 from chargetune.battery.identification.pulse_fit import cell_toml, identify, predicted_voltage
-from chargetune.battery.identification.pulses import find_pulse_sets, groups, segments
-from chargetune.battery.identification.record import Record, checked
+from chargetune.battery.identification.pulses import find_pulse_sets, groups
+from chargetune.battery.identification.record import Record, segments
 from chargetune.battery.identification.thermal import activation_energy, with_thermal
 from chargetune.battery.identification.virtual_bench import pulse_test, record_csv, slow_cycle
 from chargetune.battery.plants.steppable import as_steppable
@@ -236,8 +237,8 @@ def test_a_slow_ocv_gives_the_circuit_up_to_the_full_end():
         (lambda: identify(measured(TRUE), ocv=measured(TRUE).part(0, 50)), "no charge with current"),
         (lambda: identify(measured(TRUE), ocv=measured(TRUE)), r"passes 0\.0\d+ Ah, allowed is within 10 % of the capacity of"),
         (lambda: identify(measured(TRUE), capacity_Ah=4.0), r"do not hold the OCV; they reach from SOC 0\.5\d to 1\.00"),
-        (lambda: identify(measured(TRUE), capacity_Ah=math.nan), r"capacity_Ah = nan, allowed is \(0, 1000\] Ah"),
-        (lambda: identify(measured(TRUE), capacity_Ah=True), r"capacity_Ah = True, allowed is \(0, 1000\] Ah"),
+        (lambda: identify(measured(TRUE), capacity_Ah=math.nan), r"capacity_Ah = nan, allowed is \(0, 1500\] Ah"),
+        (lambda: identify(measured(TRUE), capacity_Ah=True), r"capacity_Ah = True, allowed is \(0, 1500\] Ah"),
         (lambda: identify(measured(replace(TRUE, C1_F=(50_000.0,) * 3))), r"at SOC 1\.00: the data do not hold tau1_s; .* longer pulses"),
         (lambda: with_thermal(TRUE, measured(TRUE), 1.0), "no column for the temperature"),
         (lambda: activation_energy({298.15: TRUE}), "at least 2"),

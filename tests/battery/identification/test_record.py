@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from chargetune.battery.identification.record import Record, checked
+from chargetune.battery.identification.plausibility import checked
+from chargetune.battery.identification.record import Record
 
 
 def record(rows, **more):

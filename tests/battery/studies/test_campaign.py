@@ -115,13 +115,13 @@ def test_a_study_that_cannot_go_on_does_not_stop_the_others(folder, workers):
         ({"seeds = [1, 4]": "seeds = '4:1'"}, "campaign.seeds = '4:1': allowed"),
         ({"seeds = [1, 4]": "seeds = '4'"}, "campaign.seeds = '4': allowed"),
         ({"seeds = [1, 4]": "seeds = 'a:b'"}, "campaign.seeds = 'a:b': allowed"),
-        ({"seeds = [1, 4]": "seeds = [true]"}, r"campaign.seeds.list\[int\].0 = True: input should be a valid integer"),
-        ({"trials = 5": "trials = 0"}, "campaign.trials = 0: input should be greater than or equal to 1"),
+        ({"seeds = [1, 4]": "seeds = [true]"}, r"campaign.seeds\[0\] = true, allowed is a whole number"),
+        ({"trials = 5": "trials = 0"}, "campaign.trials = 0, allowed is at least 1"),
         ({"trials = 5": "trails = 5"}, "campaign.trails is not a known key"),
         ({'["a.toml", "b.toml"]': "[]"}, r"campaign.configs = \[\]: list should have at least 1 item"),
         ({'"b.toml"': '"a.toml"'}, "campaign.configs = .*: allowed are files of different names"),
         ({'"b.toml"': '"none.toml"'}, "campaign.configs: there is no file .*none.toml"),
-        ({"[campaign]": "[campagne]"}, "campaign = .*: field required"),
+        ({"[campaign]": "[campagne]"}, "campagne is not a known key; did you mean campaign"),
         ({"[campaign]": "[campaign"}, "c.toml is not valid TOML"),
     ],
 )
@@ -134,7 +134,7 @@ def test_bad_campaigns_are_refused_before_anything_is_stored(folder, change, mes
 
 def test_a_study_file_with_an_error_is_named(folder):
     (folder / "b.toml").write_text("[episode]\nsteps = 1.5\n")
-    with pytest.raises(ValueError, match=r"b.toml: episode.steps = 1.5: "):
+    with pytest.raises(ValueError, match=r"b.toml: episode.steps = 1.5, allowed is a whole number"):
         load_campaign(folder / "c.toml")
     (folder / "b.toml").write_text("[episode]\nsteps = 40\n")
     with pytest.raises(ValueError, match=r"b.toml: theta is empty"):

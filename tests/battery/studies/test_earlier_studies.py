@@ -43,10 +43,10 @@ def test_a_url_is_no_path(tmp_path):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ('[[study.earlier]]\nstore = "a"', "study.earlier.0.study"),
-        ('[[study.earlier]]\nstore = ""\nstudy = "x"', "study.earlier.0.store = ''"),
-        ('[[study.earlier]]\nstore = "a"\nstudy = "x"\ntrials = 3', "study.earlier.0.trials is not a known key"),
-        ('[study.earlier]\nstore = "a"\nstudy = "x"', "study.earlier = .* valid array"),
+        ('[[study.earlier]]\nstore = "a"', r"study.earlier\[0\].study is not given"),
+        ('[[study.earlier]]\nstore = ""\nstudy = "x"', r"study.earlier\[0\].store = '', allowed is a text that is not empty"),
+        ('[[study.earlier]]\nstore = "a"\nstudy = "x"\ntrials = 3', r"study.earlier\[0\].trials is not a known key"),
+        ('[study.earlier]\nstore = "a"\nstudy = "x"', r"study.earlier = a table, allowed is tables \[\[study.earlier\]\]"),
     ],
 )
 def test_bad_tables_are_refused_by_name(tmp_path, table, message):

@@ -18,6 +18,7 @@ from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.learning import IterativeLearning
 from chargetune.learning.closed_loop.covering import _rolled, covering, predicted_rows
+from chargetune.model.model import Signal
 from charging_problems import changed, charging_problem
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -168,6 +169,13 @@ def test_nonsense_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match="iterative learning") as caught:
         IterativeLearning(ChargingTwin(charge(R0=ResistanceRatio())), **given)
     assert said in str(caught.value)
+
+
+def test_a_controller_with_given_signals_is_refused():
+    problem = charge(R0=ResistanceRatio())
+    told = SimpleNamespace(controller=replace(controller_of(problem), given=(Signal("price"),)))
+    with pytest.raises(ValueError, match="given = price, allowed is none"):
+        IterativeLearning(told)
 
 
 def test_a_step_that_cannot_be_found_is_warned_of_and_theta_stays():

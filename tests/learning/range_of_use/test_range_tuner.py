@@ -150,3 +150,35 @@ def test_run_plants_is_the_same_in_batches_as_one_by_one():
 def test_nonsense_is_refused_by_name(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_each_draw_has_a_case_of_the_given_signals():
+    """T+ = 0.8 T + 0.2 gain u + rain, the controller blind: each draw is one that is run alone under its own rain."""
+    wet = ct.Model.build(
+        "wet heater", states=(ct.Signal("T", "K"),), inputs=(ct.Signal("u"),), outputs=(ct.Signal("T", "K"),),
+        parameters={"gain": 1.0, "rain": 0.0}, sampling_time_s=1.0,
+        equations=lambda x, u, p: ({"T": 0.8 * x["T"] + 0.2 * p["gain"] * u["u"] + p["rain"]}, {"T": x["T"]}),
+    )  # fmt: skip
+    controller = ct.Controller.build(
+        wet, SPACE, horizon=1, stage_cost=lambda s: (s.u["u"] - s.theta["power"] * s.given["price"]) ** 2, input_lower={"u": 0.0},
+        input_upper={"u": 2.0}, given=(ct.Signal("price"),),
+    )  # fmt: skip
+    plant = ct.SimulatedPlant(wet, {}, given=("rain",), input_before={"u": 0.5})
+    draws = ct.RangeOfUse(plant, (ct.Variation("gain", ct.Uniform(-0.25, 0.25), parameters={"gain": 1.0}),))
+    cases = [{"price": 1.0, "rain": np.linspace(0.0, 0.1, STEPS)}, {"price": np.linspace(1.0, 0.2, STEPS), "rain": -0.05}]
+    own = ct.SimulatedRange(controller, draws, STEPS, (ct.ScoredLimit("T", upper=LIMIT),), heat, given=cases)
+    plants = own.draw(8, 0)
+    assert all(one.plant.input_before == {"u": 0.5} for one in plants)
+    found = own.simulate([np.array([1.0])] * 8, plants)
+    matches = []
+    for episode, drawn in zip(found, plants, strict=True):
+        alone = [ct.run_episode(controller, drawn.plant, steps=STEPS, theta=[1.0], seed=drawn.seed, given=case) for case in cases]
+        matches.append([bool(np.allclose(episode.output_end, one.output_end, atol=1e-6)) for one in alone])
+    assert all(sum(one) == 1 for one in matches)
+    assert 0 < sum(first for first, _ in matches) < 8
+    with pytest.raises(ValueError, match="given: missing"):
+        ct.SimulatedRange(controller, draws, STEPS, (), heat)
+    with pytest.raises(ValueError, match="no case"):
+        ct.SimulatedRange(controller, draws, STEPS, (), heat, given=[])
+    with pytest.raises(ValueError, match=r"names \['rain'\], allowed are none that follow a given signal"):
+        ct.RangeOfUse(plant, (ct.Variation("rain", ct.Uniform(-0.25, 0.25), parameters={"rain": 1.0}),))

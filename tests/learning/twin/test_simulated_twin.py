@@ -10,6 +10,7 @@ from chargetune.control.controller import Controller, SoftLimit
 from chargetune.episode.episode import Ending
 from chargetune.episode.score_limits import ScoredLimit, Windows
 from chargetune.episode.stepwise import run_episode
+from chargetune.learning.twin.rollout import predict, slopes
 from chargetune.learning.twin.simulated_twin import SimulatedTwin
 from chargetune.learning.twin.twin import Uncertain
 from chargetune.model.model import Model, Signal
@@ -113,3 +114,74 @@ def test_what_is_not_given_follows_from_limits_and_input_bounds():
 def test_nonsense_is_refused_when_it_is_made(changes, message):
     with pytest.raises(ValueError, match=message):
         build(**changes)
+
+
+RAIN = 0.02 + 0.02 * np.cos(0.4 * np.arange(30))
+GOAL = np.where(np.arange(30) < 10, 1.5, 1.7)
+
+
+def rained(outflow):
+    """The tank with rain as well, a parameter that follows a given signal."""
+
+    def equations(x, u, p):
+        out = p["outflow"] * ca.sqrt(ca.fmax(x["level"], 1e-3))
+        return {"level": x["level"] + u["inflow"] + p["rain"] - out}, {"level": x["level"], "out": out + 0.1 * p["rain"]}
+
+    return Model.build(
+        "tank", states=[Signal("level", "m")], inputs=[Signal("inflow")], outputs=[Signal("level", "m"), Signal("out")],
+        parameters={"outflow": outflow, "rain": 0.0}, sampling_time_s=1.0, equations=equations,
+    )  # fmt: skip
+
+
+TOLD = Controller.build(
+    rained(0.1), SPACE, horizon=4, stage_cost=lambda s: (s.x["level"] - s.given["goal"]) ** 2 + 0.01 * s.u["inflow"] ** 2,
+    input_lower={"inflow": 0.0}, input_upper={"inflow": 0.3}, start={"level": 1.0}, given=(Signal("goal", "m"), Signal("rain", "m")),
+    parameters=lambda s: {"rain": s.given["rain"]}, limits=[SoftLimit("level", upper=lambda s: 1.8 - s.theta["margin"])],
+)  # fmt: skip
+FORECAST = np.stack([np.concatenate([RAIN[k : k + 1], np.full(4, 0.02)]) for k in range(20)])
+
+
+def under_rain(**changes):
+    settings = {"given": {"goal": GOAL, "rain": FORECAST}, "plant_given": ("rain",)} | changes
+    return SimulatedTwin.build(
+        TOLD, rained(0.1), UNKNOWNS, noise_sd=NOISE, steps=20, limits=LIMITS, objective=mean_level, start={"level": 1.0}, **settings
+    )
+
+
+def test_given_signals_are_those_of_an_episode_step_by_step_and_of_the_roll_outs():
+    """The controller is told forecasts of the rain that are wrong, the plant and its twin follow the rain as it comes."""
+    loop, theta, m = under_rain(), np.array([0.1]), np.array([0.1, 0.2, 0.03])
+    (found,) = loop.simulate([(theta, m, None)])
+    plant = SimulatedPlant(rained(0.1 * np.exp(0.1)), {"level": 1.2}, Sensors(bias={"level": 0.03}), given=("rain",))
+    expected = run_episode(TOLD, plant, steps=20, theta=theta, given={"goal": GOAL, "rain": FORECAST})
+    np.testing.assert_allclose(found.output_end, expected.output_end, atol=1e-7)
+    np.testing.assert_allclose(found.input, expected.input, atol=1e-6)
+    for part in (found, found.cut(7, Ending.LIMIT, "")):
+        predicted = predict(loop.twin, m, part.input)
+        np.testing.assert_allclose(predicted[:, 0], part.output_start, atol=1e-7)
+        np.testing.assert_allclose(predicted[:, 1], part.output_end, atol=1e-7)
+    step = 1e-6 * np.eye(3)
+    numeric = [(predict(loop.twin, m + one, found.input) - predict(loop.twin, m - one, found.input)) / 2e-6 for one in step]
+    np.testing.assert_allclose(slopes(loop.twin, m, found.input), np.stack(numeric, axis=-1), atol=1e-6)
+    assert loop.twin.content != under_rain(given={"goal": GOAL, "rain": 0.0}).twin.content
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"given": {"goal": GOAL}}, r"given: missing \['rain'\]"),
+        ({"given": None}, "given: missing"),
+        ({"given": {"goal": GOAL[:10], "rain": 0.0}}, "goal has 10 intervals, allowed are at least the 20"),
+        ({"given": {"goal": GOAL, "rain": np.nan}}, "allowed are finite numbers"),
+        ({"plant_given": ("outflow",), "given": {"goal": GOAL, "rain": 0.0, "outflow": 0.1}}, r"given = \['outflow'\], allowed .* rain"),
+    ],
+)
+def test_given_signals_that_do_not_fit_are_refused(changes, words):
+    with pytest.raises(ValueError, match=words):
+        under_rain(**changes)
+
+
+def test_a_twin_that_follows_something_else_than_the_controller_is_told_is_refused():
+    loop = under_rain()
+    with pytest.raises(ValueError, match="given of rain is not what the plant follows"):
+        replace(loop, given={"goal": GOAL, "rain": 0.0})

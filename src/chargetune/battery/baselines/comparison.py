@@ -5,20 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
 from chargetune.battery.charging.evaluate import plant_of, run_charge
-from chargetune.battery.charging.problem import ChargingProblem, with_feedback
+from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant, with_feedback
 from chargetune.battery.charging.tunables import Backoff, Tunables
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
-__all__ = ["Row", "Verdict", "compare", "constant_backoff", "plant_oracle", "row_names", "smallest_that_keeps"]
+__all__ = [
+    "CCCV", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "plant_oracle", "row_names",
+    "smallest_that_keeps",
+]  # fmt: skip
+
+# CC-CV at the fastest rate with which every limit is kept.
+CCCV = "CC-CV that keeps all limits"
+# That rate is found to this share of the largest current.
+RATE_TOLERANCE = 1 / 64
 
 # Shares of the largest current: of CC-CV, and of five steps in five equal SOC windows.
 CCCV_SHARES = (0.25, 0.5, 1.0)
@@ -30,12 +39,16 @@ BACKOFF_MAX_V = 0.3
 
 @dataclass(frozen=True)
 class Row:
-    """One way of charging: its episode without sensor noise, and the verdict on that. No score where it did not come to its end."""
+    """One way of charging: its episode without sensor noise, and the verdict on that. No score where it did not come to its end.
+
+    ``setting``: what was chosen for this plant, such as the rate of CC-CV; empty where nothing was.
+    """
 
     name: str
     episode: Episode
     score: Score | None
     noise: Mapping[str, float]
+    setting: str = ""
 
     @property
     def worst_excess(self) -> dict[str, float | None]:
@@ -59,27 +72,40 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
     """What can be compared on this plant, in the order of the table."""
     largest = problem.current_max_A
     names = [f"CC-CV {share * largest:.3g} A" for share in CCCV_SHARES]
-    names += ["multi-step CC", "four-step CC (Attia)", "plant oracle"]
+    names += [CCCV, "multi-step CC", "four-step CC (Attia)", "plant oracle"]
     if as_steppable(plant_of(problem)) is None:
         names = []
     names += ["nominal MPC"]
     if problem.estimator.kind not in ("offset_free", "adaptive"):
         names.append("nominal offset-free MPC")
     names.append("best constant backoff")
-    if problem.plant is None:
+    if problem.plant_cell is not None:
         names.append("MPC with the true model")
     return [*names, *(["tuned"] if theta is not None else [])]
 
 
+def chosen_rows(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """Those of ``names`` that are wanted, in their own order; all where none is named. Raises ValueError for another name."""
+    for name in wanted:
+        if name not in names:
+            raise ValueError(f"--row {name!r}, allowed are {', '.join(map(repr, names))}")
+    return [name for name in names if not wanted or name in wanted]
+
+
 def compare(
-    problem: ChargingProblem, theta: Sequence[float] | None = None, *, seed: int = 0, executor: Executor | None = None
+    problem: ChargingProblem,
+    theta: Sequence[float] | None = None,
+    *,
+    rows: Sequence[str] = (),
+    seed: int = 0,
+    executor: Executor | None = None,
 ) -> Iterator[Row]:
-    """Run every row of `row_names`, in the order in which they are done.
+    """Run every row of `row_names`, or the named ones, in the order in which they are done. Raises ValueError for an unknown row.
 
     CC-CV, step charging and the oracle keep their limits exactly, without sensors: CC-CV and the steps the voltage, the
     oracle every limit. Controllers see the problem's sensors with noise of ``seed``; all are judged without noise.
     """
-    names = row_names(problem, theta)
+    names = chosen_rows(row_names(problem, theta), rows)
     if executor is None:
         yield from (_row(problem, name, theta, seed) for name in names)
         return
@@ -95,11 +121,12 @@ def plant_oracle(problem: ChargingProblem) -> Row | None:
 def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, seed: int) -> Row:
     largest = problem.current_max_A
     voltage = [problem.limits_by_name["voltage_max_V"]]
+    if name == CCCV:
+        return _fastest(problem, name, voltage)
     if name.startswith("CC-CV"):
         share = CCCV_SHARES[row_names(problem, theta).index(name)]
         return _stepped(problem, name, constant_current(share * largest), voltage)
     plain = replace(problem, theta=Tunables())
-    true = replace(plain, controller=replace(plain.controller, mismatch_seed=None))
     table: dict[str, Callable[[], Row]] = {
         "multi-step CC": lambda: _stepped(problem, name, multi_step([s * largest for s in STEP_SHARES]), voltage),
         "four-step CC (Attia)": lambda: _stepped(
@@ -109,13 +136,23 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
         "nominal offset-free MPC": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
         "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
-        "MPC with the true model": lambda: _judged(plain, name, run_charge(true, None, seed)),
+        "MPC with the true model": lambda: _judged(plain, name, run_charge(knowing_the_plant(plain), None, seed)),
         "tuned": lambda: _judged(problem, name, run_charge(problem, theta, seed)),
     }
     return table[name]()
 
 
-def _stepped(problem: ChargingProblem, name: str, law: CurrentLaw, limits: Sequence[object]) -> Row:
+def _fastest(problem: ChargingProblem, name: str, limits: Sequence[object]) -> Row:
+    largest = problem.current_max_A
+
+    @cache
+    def row(share: float) -> Row:
+        return _stepped(problem, name, constant_current(share * largest), limits, f"{share * largest:.3g} A")
+
+    return row(largest_share(lambda share: not row(share).breaks_limit))
+
+
+def _stepped(problem: ChargingProblem, name: str, law: CurrentLaw, limits: Sequence[object], setting: str = "") -> Row:
     stepped = as_steppable(plant_of(problem))
     if stepped is None:
         raise ValueError(f"{name}: the next interval of this plant cannot be tried")
@@ -127,19 +164,21 @@ def _stepped(problem: ChargingProblem, name: str, law: CurrentLaw, limits: Seque
         soc_target=problem.episode.soc_target,
         current_max_A=problem.current_max_A,
     )
-    return _judged(problem, name, episode)
+    return _judged(problem, name, episode, setting)
 
 
-def _judged(problem: ChargingProblem, name: str, episode: Episode) -> Row:
+def _judged(problem: ChargingProblem, name: str, episode: Episode, setting: str = "") -> Row:
     true = episode.noise_free()
     exact = replace(problem, objective=replace(problem.objective, verdict_samples=1))
     noise = {limit.name: problem.sensors.noise_sd.get(limit.signal, 0.0) for limit in problem.limits_by_name.values()}
-    return Row(name, true, score_episode(exact, true) if true.ending is Ending.DONE else None, noise)
+    return Row(name, true, score_episode(exact, true) if true.ending is Ending.DONE else None, noise, setting)
 
 
 def _best_backoff(plain: ChargingProblem, name: str, seed: int) -> Row:
     tuned, largest = constant_backoff(plain)
-    return smallest_that_keeps(lambda value: _judged(plain, name, run_charge(tuned, [value, value], seed)), largest)
+    return smallest_that_keeps(
+        lambda value: _judged(plain, name, run_charge(tuned, [value, value], seed), f"{1e3 * value:.1f} mV"), largest
+    )
 
 
 def constant_backoff(plain: ChargingProblem) -> tuple[ChargingProblem, float]:
@@ -158,6 +197,15 @@ class Verdict(Protocol):
 
 
 T = TypeVar("T", bound=Verdict)
+
+
+def largest_share(kept: Callable[[float], bool]) -> float:
+    """The largest share in (0, 1] that is kept, by bisection to `RATE_TOLERANCE`; the smallest one tried where none is."""
+    low, high = (1.0, 1.0) if kept(1.0) else (0.0, 1.0)
+    while high - low > RATE_TOLERANCE:
+        middle = (low + high) / 2
+        low, high = (middle, high) if kept(middle) else (low, middle)
+    return low or high
 
 
 def smallest_that_keeps(run: Callable[[float], T], largest: float) -> T:

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
-from chargetune.battery.baselines.comparison import constant_backoff, smallest_that_keeps
+from chargetune.battery.baselines.comparison import CCCV, chosen_rows, constant_backoff, largest_share, smallest_that_keeps
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.limits import Limit
-from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant
 from chargetune.battery.charging.tunables import Tunables
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.compiled import compiled_episode
@@ -28,8 +28,6 @@ __all__ = ["DRAWS", "ORACLE", "RangeRow", "compare_range", "range_row_names"]
 # Plants that are charged in every way: means of a time over so many are sure to a per cent, and the oracle takes seconds for each.
 DRAWS = 40
 ORACLE = "plant oracle"
-# The rate of CC-CV is found to this share of the largest current.
-RATE_TOLERANCE = 1 / 64
 
 
 @dataclass(frozen=True)
@@ -65,20 +63,26 @@ class RangeRow:
 
 def range_row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
     """What can be compared over the range, in the order of the table."""
-    names = ["CC-CV", "nominal MPC", "best constant backoff", *(["tuned"] if theta is not None else [])]
-    return [*names, *(["MPC that knows each plant"] if problem.plant is None else []), ORACLE]
+    names = [CCCV, "nominal MPC", "best constant backoff", *(["tuned"] if theta is not None else [])]
+    return [*names, *(["MPC that knows each plant"] if problem.plant_cell else []), ORACLE]
 
 
 def compare_range(
-    problem: ChargingProblem, theta: Sequence[float] | None = None, *, draws: int = DRAWS, seed: int = 0, executor: Executor | None = None
+    problem: ChargingProblem,
+    theta: Sequence[float] | None = None,
+    *,
+    rows: Sequence[str] = (),
+    draws: int = DRAWS,
+    seed: int = 0,
+    executor: Executor | None = None,
 ) -> Iterator[RangeRow]:
-    """Run every row of `range_row_names` on the same plants of the problem's range of use, in the order in which they are done.
+    """Run every row of `range_row_names`, or the named ones, on the same plants of the range of use, in the order in which they are done.
 
     CC-CV has the fastest rate, and the constant backoff the smallest value, with which every limit is kept on all of the plants; where
     none does, the most cautious one. CC-CV keeps the voltage exactly, the oracle every limit: it knows each plant. Controllers see the
-    problem's sensors with noise; all are judged by the true outputs. Raises ValueError without a range.
+    problem's sensors with noise; all are judged by the true outputs. Raises ValueError without a range, or for an unknown row.
     """
-    names = range_row_names(problem, theta)
+    names = chosen_rows(range_row_names(problem, theta), rows)
     drawn = _Drawn(problem, draws, seed)
     if executor is None:
         yield from (drawn.row(name, theta) for name in names)
@@ -111,11 +115,13 @@ class _Drawn:
         problem = self.problem
         plain = replace(problem, theta=Tunables())
         table: dict[str, Callable[[], RangeRow]] = {
-            "CC-CV": lambda: self._fastest(name),
+            CCCV: lambda: self._fastest(name),
             "nominal MPC": lambda: self._controlled(name, problem, problem.space.default),
             "best constant backoff": lambda: self._backoff(name, plain),
             "tuned": lambda: self._controlled(name, problem, np.array(theta)),
-            "MPC that knows each plant": lambda: RangeRow(name, tuple(self._score(_knowing(plain, one)) for one in self.plants)),
+            "MPC that knows each plant": lambda: RangeRow(
+                name, tuple(self._score(_knowing(knowing_the_plant(plain), one)) for one in self.plants)
+            ),
             ORACLE: lambda: RangeRow(name, tuple(self._stepped(one, 1.0, list(problem.limits_by_name.values())) for one in self.plants)),
         }
         return table[name]()
@@ -156,11 +162,7 @@ class _Drawn:
                     return False
             return True
 
-        low, high = (1.0, 1.0) if kept(1.0) else (0.0, 1.0)
-        while high - low > RATE_TOLERANCE:
-            middle = (low + high) / 2
-            low, high = (middle, high) if kept(middle) else (low, middle)
-        share = low or high
+        share = largest_share(kept)
         return RangeRow(name, tuple(score(share, i) for i in range(len(self.plants))), f"{share * self.problem.current_max_A:.3g} A")
 
     def _stepped(self, one: DrawnPlant, share: float, limits: Sequence[Limit]) -> Score | None:

@@ -16,6 +16,7 @@ from chargetune.battery.charging.problem import ChargingProblem, with_feedback
 from chargetune.battery.studies.open_study import open_study
 from chargetune.battery.studies.study_file import TunerName, problem_of_document
 from chargetune.episode.episode import Episode
+from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.result import read_result
 from chargetune.study.store.store import Store
 from chargetune.study.trial import Trial
@@ -50,6 +51,7 @@ def reproduce(
     rows: dict[int, dict[str, Any]] = {}
     try:
         for future in as_completed(futures):
+            raise_lost_interrupt()
             seed = futures[future]
             rows[seed] = future.result()
             if progress is not None:

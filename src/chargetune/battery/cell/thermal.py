@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
+from pydantic import Field
 
 from chargetune.model.splines import pchip
 
@@ -30,14 +31,18 @@ class Thermal:
     constants R C stay: C changes by 1 / s(T). Source: Bernardi et al., J. Electrochem. Soc. 132 (1985) 5, doi 10.1149/1.2113792.
     """
 
-    heat_capacity_J_K: float
-    cooling_W_K: float
-    ambient_K: float = 298.15
-    reference_K: float = 298.15
-    activation_J_mol: float = 0.0
-    entropic_V_K: float = 0.0
-    factor_K: tuple[float, ...] = ()
-    factor: tuple[float, ...] = ()
+    heat_capacity_J_K: Annotated[float, Field(description="Heat capacity of one cell, J/K; more than 0, at most 1e6.")]
+    cooling_W_K: Annotated[float, Field(description="Heat that one cell loses per kelvin above ambient, W/K; more than 0, at most 1e4.")]
+    ambient_K: Annotated[float, Field(description="Temperature of the surroundings and of the cell at its start, K; 200 to 400.")] = 298.15
+    reference_K: Annotated[float, Field(description="Temperature at which the circuit's tables hold, K; 200 to 400.")] = 298.15
+    activation_J_mol: Annotated[
+        float, Field(description="Activation energy of all resistances, J/mol; at most 2e5. Not together with factor.")
+    ] = 0.0
+    entropic_V_K: Annotated[float, Field(description="Entropic coefficient dOCV/dT, V/K; -0.01 to 0.01.")] = 0.0
+    factor_K: Annotated[tuple[float, ...], Field(description="Temperatures of the table factor, K; increasing within 200 to 400.")] = ()
+    factor: Annotated[
+        tuple[float, ...], Field(description="Factor on all resistances over factor_K, 1; more than 0, at most 100, 1 at reference_K.")
+    ] = ()
 
     def __post_init__(self) -> None:
         for name in ("factor_K", "factor"):

@@ -153,7 +153,8 @@ def write_certificate(
         "versions": versions(),
         "origin": dict(origin),
         "theta": dict(theta),
-        "cell": {"name": problem.cell.name, "remark": problem.cell.remark},
+        "cell": {"name": problem.cell.title, "remark": problem.cell.remark},
+        "plant": problem.plant_line,
         "sampling_time_s": problem.controller.sampling_time_s,
         "steps": problem.episode.steps,
         "soc_start": problem.episode.soc_start,
@@ -162,7 +163,7 @@ def write_certificate(
         "confidence": confidence,
         "range": {} if problem.range is None else problem.range.entries,
         "meaning": MEANING,
-        "drawn": DRAWN if problem.plant is None else f"{DRAWN} {DRAWN_ELECTROCHEMICAL}",
+        "drawn": DRAWN if problem.plant_cell else f"{DRAWN} {DRAWN_ELECTROCHEMICAL}",
         "judged": "true outputs, without sensor noise, at both ends of every interval",
         "limits": [
             {"name": limit.name, "signal": limit.signal, "upper": limit.upper, "bound": limit.bound, "tolerance": limit.tolerance}

@@ -25,4 +25,4 @@ def default_range(problem: ChargingProblem) -> ChargingRangeSettings:
     low = max(0.0, start - SOC_START)
     settings = replace(USUAL, soc_start=(low, max(low, min(start + SOC_START, wanted - SOC_ROOM))))
     none: dict[str, Any] = dict.fromkeys(NOT_ELECTROCHEMICAL, 0.0)
-    return settings if problem.plant is None else replace(settings, **none)
+    return settings if problem.plant_cell else replace(settings, **none)

@@ -35,11 +35,11 @@ LARGEST = ("overshoot_mV", "overshoot_mVs", "violation_mVs", "current_max_excess
 
 
 def range_of_use(problem: ChargingProblem, settings: ChargingRangeSettings) -> RangeOfUse:
-    """The cell's circuit with what ``settings`` say that differs.
+    """The plant's circuit, or where it has none the cell's, with what ``settings`` say that differs.
 
     The start of each charge is at rest, and where the cell has a temperature in equilibrium with its ambient.
     """
-    cell = problem.cell
+    cell = problem.plant_cell or problem.cell
     resistances, capacitances = ([n for n in cell.tables if n.startswith(letter)] for letter in "RC")
     out = [
         Variation(name, Uniform(-width, width), parameters=dict.fromkeys(tables, 1.0), by_entry=name.endswith("node"))
@@ -67,7 +67,7 @@ def range_of_use(problem: ChargingProblem, settings: ChargingRangeSettings) -> R
         bias = Uniform(-settings.voltage_bias_V, settings.voltage_bias_V)
         out.append(Variation("voltage_bias_V", bias, biases={"voltage_V": 1.0}, of="episode"))
     # Another plant may measure what the circuit does not have.
-    sensors = problem.sensors.sensors() if problem.plant is None else Sensors()
+    sensors = problem.sensors.sensors() if problem.plant_cell else Sensors()
     plant = SimulatedPlant(ecm_model(cell, problem.controller.sampling_time_s), start, sensors)
     return RangeOfUse(plant, tuple(out), {"soc": (0.0, 1.0)})
 
@@ -98,7 +98,7 @@ class ChargingRange:
         if self.problem.range is None:
             raise ValueError("range = None, allowed is a table [range] that says what differs")
         known, settings = self.problem.plant, self.problem.range
-        if known is None:
+        if self.problem.plant_cell is not None or known is None:
             return
         if not isinstance(known, Electrochemical):
             raise ValueError(f"plant {known!r}: a range of use has the cell's circuit or an electrochemical model")
@@ -125,7 +125,7 @@ class ChargingRange:
 
     def run(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode]:
         """The episode of each theta on the plant of the same place as it was measured, however it ended."""
-        if self.problem.plant is None:
+        if self.problem.plant_cell is not None:
             return self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
         from chargetune.episode.stepwise import run_episode
 

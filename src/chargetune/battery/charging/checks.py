@@ -52,6 +52,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
             signs=signs,
             finer=finer,
             quick=quick,
+            along="soc",
         )
     )
     if any(finding.code == "unsafe-start" for finding in found):
@@ -139,7 +140,7 @@ def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:
 
 
 def _voltage_excess(problem: ChargingProblem, theta: NDArray[np.float64]) -> float:
-    return max(float(np.max(values)) for values in run_charge(problem, theta).signal("voltage_V", true=True)) - problem.voltage_max_V
+    return float(np.max(run_charge(problem, theta).signal("voltage_V", true=True))) - problem.voltage_max_V
 
 
 def _plant_signs(problem: ChargingProblem, steps: int) -> list[Finding]:

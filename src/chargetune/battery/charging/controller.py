@@ -49,7 +49,8 @@ def _build(problem: ChargingProblem) -> Controller:
         bound = largest * theta.current_limit.share(stage) if theta.current_limit else largest
         if settings.current_ramp_A_s is None:
             return bound
-        return ca.fmin(bound, ca.fmax(stage.now["last_current_A"], 0.0) + settings.current_ramp_A_s * settings.sampling_time_s)
+        ramp = stage.theta["current_ramp_A_s"] if theta.current_ramp else settings.current_ramp_A_s
+        return ca.fmin(bound, ca.fmax(stage.now["last_current_A"], 0.0) + ramp * settings.sampling_time_s)
 
     # Both models come from the same cell, so that the compiled problem is the same for every mismatch.
     belief = problem.controller_cell
@@ -121,10 +122,14 @@ def estimator_of(problem: ChargingProblem, model: Model) -> Estimator:
     cell, observer = problem.cell, problem.estimator.settings
     thermal = ("temperature_K",) if cell.thermal else ()
     if isinstance(observer, Kalman):
-        return observer.estimator(overpotentials(cell), thermal=bool(thermal), tuned=problem.theta.voltage_sd is not None)
+        return observer.estimator(model, overpotentials(cell), thermal=bool(thermal), tuned=problem.theta.voltage_sd is not None)
     if observer is not None:
         return observer_filter(cell, model, observer)
-    return Propagated(("soc", *thermal)) if problem.estimator.kind == "open_loop" else ExactState()
+    if problem.estimator.kind == "open_loop":
+        return Propagated(("soc", *thermal))
+    # The last current is the controller's own, and no output of the plant.
+    own = tuple(name for name in model.state_names if name != "last_current_A")
+    return ExactState() if own == model.state_names else Propagated(own)
 
 
 def measured_rows(problem: ChargingProblem, episode: Episode) -> NDArray[np.float64]:

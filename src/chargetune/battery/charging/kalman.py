@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 from chargetune.battery.validation import check_number
 from chargetune.control.kalman import ExtendedKalman
+from chargetune.model.model import Model
 
 __all__ = ["Kalman"]
 
@@ -30,12 +31,12 @@ class Kalman:
             measured = part.name in ("voltage_sd_V", "temperature_sd_K")
             check_number(f"kalman: {part.name}", getattr(self, part.name), 0.0, 100.0, open_low=measured)
 
-    def estimator(self, overpotentials: tuple[str, ...], *, thermal: bool, tuned: bool = False) -> ExtendedKalman:
-        """The filter for states SOC, overpotentials and, ``thermal``, temperature; ``tuned``: theta sets the voltage's spread."""
-        pairs, warm = len(overpotentials), int(thermal)
-        return ExtendedKalman(
-            measured=("voltage_V", *(["temperature_K"] * warm)),
-            measurement_sd=("voltage_sd_V" if tuned else self.voltage_sd_V, *([self.temperature_sd_K] * warm)),
-            process_sd=(self.soc_process_sd, *([self.overpotential_process_sd_V] * pairs), *([self.temperature_process_sd_K] * warm)),
-            start_sd=(self.soc_start_sd, *([0.0] * pairs), *([self.temperature_sd_K] * warm)),
-        )
+    def estimator(self, model: Model, overpotentials: tuple[str, ...], *, thermal: bool, tuned: bool = False) -> ExtendedKalman:
+        """The filter for SOC, overpotentials and, ``thermal``, temperature; ``tuned``: theta sets the voltage's spread."""
+        measurement: dict[str, float | str] = {"voltage_V": "voltage_sd_V" if tuned else self.voltage_sd_V}
+        process = {"soc": self.soc_process_sd, **dict.fromkeys(overpotentials, self.overpotential_process_sd_V)}
+        start = {"soc": self.soc_start_sd}
+        if thermal:
+            measurement["temperature_K"] = start["temperature_K"] = self.temperature_sd_K
+            process["temperature_K"] = self.temperature_process_sd_K
+        return ExtendedKalman.of(model, measurement_sd=measurement, process_sd=process, start_sd=start)

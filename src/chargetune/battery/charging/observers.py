@@ -26,6 +26,8 @@ __all__ = ["Adaptive", "OffsetFree", "observer_filter", "observer_model", "setti
 MINUTE_S = 60.0
 # Newton steps from the inverse table to the SOC at which the OCV is the voltage at rest: error below 1e-4.
 NEWTON_STEPS = 2
+# An OCV that rises by less from empty to full (V) is flat there (LFP), and a Newton step would leave it on a millivolt of noise.
+FLAT_V = 0.02
 RESISTANCE_FACTOR = "resistance_factor"
 
 
@@ -33,14 +35,14 @@ RESISTANCE_FACTOR = "resistance_factor"
 class OffsetFree:
     """Offset-free MPC: the voltage's error of the model is a disturbance that the filter follows, constant over the horizon.
 
-    All but resistance_rate and backoff_sd are standard deviations; ``.._drift`` is what a random walk adds in a minute. The first
+    All but backoff_sd are standard deviations; ``.._drift`` is what a random walk adds in a minute. The first
     measurement, at rest, sets the SOC through the OCV (``soc_from_rest``; else the believed start does). From then on it is "counted",
     with the controller's own capacity, or "measured". Overpotentials follow the controller's
     own model; a temperature is measured and filtered.
 
-    The variance that an interval adds to the disturbance is q^2 = offset_drift_V^2 Ts / 60 s + (R I resistance_rate dz)^2, the second
-    term for resistances whose relative error changes by resistance_rate over the whole SOC, dz the SOC of the interval and R the mean of
-    all resistances. The steady-state gain K follows from it and r = voltage_sd_V: K^2 / (1 - K) = q^2 / r^2. At a voltage limit the
+    The variance that an interval adds to the disturbance is q^2 = offset_drift_V^2 Ts / 60 s + (R I resistance_drift)^2 dz, the second
+    term for a relative error of the resistances that walks by resistance_drift over the whole SOC, dz the SOC of the interval, R the
+    mean of all resistances. The steady-state gain K follows from it and r = voltage_sd_V: K^2 / (1 - K) = q^2 / r^2. At a voltage limit the
     current swings from sample to sample where K R / R_believed is above 1, and rings on near 2 (`check_ringing`).
 
     backoff_sd
@@ -55,7 +57,7 @@ class OffsetFree:
     voltage_sd_V: float = 2e-3
     offset_start_sd_V: float = 5e-3
     offset_drift_V: float = 3e-3
-    resistance_rate: float = 2.0
+    resistance_drift: float = 0.15
     backoff_sd: float = 3.0
     soc_sd: float = 1e-3
     temperature_sd_K: float = 0.1
@@ -173,8 +175,8 @@ def voltage_backoff(cell: Cell, model: Model, current_max_A: float, observer: Ob
         b(I) = k (s(0) + (s(I_max) - s(0)) (I / I_max)^2)
 
     with s(I) = sqrt(C P C') from the filter's Riccati equation at this current and half charge (`riccati.steady_filter`): noise that is
-    left, drift in one interval, and what the estimate lags behind. s is nearly quadratic: what is unknown of the resistances changes
-    by R I per SOC, and the SOC by I Ts. k = 3 is one sample in 740.
+    left, drift in one interval, and what the estimate lags behind. s is between these two at rest and at the largest current, and grows
+    more than linearly: what is unknown of the resistances changes with R I and the root of the SOC that passes. k = 3 is one sample in 740.
     """
     estimator = observer_filter(cell, model, observer)
     x = np.zeros(len(model.states))
@@ -194,9 +196,10 @@ def _scaled(p: Named, _: Named, name: str, share: float) -> Any:
 
 
 def _offset_drift(p: Named, u: Named, cell: Cell, sampling_time_s: float) -> Any:
-    """What an interval adds to the voltage's error, sd: a drift with time, and one of the resistances over the SOC, R I rate dz."""
-    with_current = p["resistance_rate"] * _resistance(p, cell) * u["current_A"] * _charge(u, p, sampling_time_s)
-    return ca.sqrt(p["offset_drift_V"] ** 2 * sampling_time_s / MINUTE_S + with_current**2)
+    """What an interval adds to the voltage's error, sd: a drift with time, and R I times one of the resistances over the SOC."""
+    # Both are random walks, so that one number holds for every sampling time: a variance in proportion to time, and to charge.
+    of_charge = (_resistance(p, cell) * u["current_A"] * p["resistance_drift"]) ** 2 * ca.fabs(_charge(u, p, sampling_time_s))
+    return ca.sqrt(p["offset_drift_V"] ** 2 * sampling_time_s / MINUTE_S + of_charge)
 
 
 def _resistance(p: Named, cell: Cell) -> Any:
@@ -216,13 +219,16 @@ def _per_charge(p: Named, u: Named, name: str, sampling_time_s: float) -> Any:
 
 def _soc_at_rest(y: Mapping[str, Any], _: Named, cell: Cell) -> dict[str, Any]:
     """The SOC whose OCV is the voltage at rest, within 0 and 1: from the inverse table by Newton steps on the table itself."""
-    voltage = ca.fmin(ca.fmax(y["voltage_V"], cell.ocv_V[0]), cell.ocv_V[-1])
+    # Where the table is flat the voltage tells no SOC but that it is in there: its middle.
+    volts = sorted(set(cell.ocv_V))
+    middles = [float(np.mean([z for z, v in zip(cell.ocv_soc, cell.ocv_V, strict=True) if v == value])) for value in volts]
+    voltage = ca.fmin(ca.fmax(y["voltage_V"], volts[0]), volts[-1])
     z = ca.SX.sym("z")
     ocv = pchip(z, cell.ocv_soc, cell.ocv_V)
     step = ca.Function("newton", [z], [ocv, ca.jacobian(ocv, z)])
-    soc = pchip(voltage, cell.ocv_V, cell.ocv_soc)
+    soc = pchip(voltage, volts, middles)
     for _step in range(NEWTON_STEPS):
         value, slope = step(soc)
-        soc = ca.fmin(ca.fmax(soc + (voltage - value) / ca.fmax(slope, 1e-3), 0.0), 1.0)
+        soc = ca.fmin(ca.fmax(soc + (voltage - value) / ca.fmax(slope, FLAT_V), 0.0), 1.0)
     # A sample that is lost says nothing: fmin and fmax would drop the nan.
     return {"soc": ca.if_else(ca.fabs(y["voltage_V"]) < math.inf, soc, ca.SX.nan())}

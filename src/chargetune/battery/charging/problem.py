@@ -23,13 +23,14 @@ from chargetune.battery.charging.settings import (
     SensorSettings,
 )
 from chargetune.battery.charging.tunables import Tunables
+from chargetune.battery.plants.circuit import Circuit
 from chargetune.battery.validation import check_count, check_number
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.plant import Plant
 from chargetune.plants.sensors import Sensors
 from chargetune.runtime.cache import built_once
 
-__all__ = ["ChargingProblem", "PlantModel", "judged_exactly", "stand_in", "with_feedback"]
+__all__ = ["ChargingProblem", "PlantModel", "judged_exactly", "knowing_the_plant", "stand_in", "with_feedback"]
 
 
 class PlantModel(Protocol):
@@ -79,10 +80,11 @@ class ChargingProblem:
 
     def _check_bounds(self) -> None:
         cell = self.cell
-        least = check_number("current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, "A")
-        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, "A", open_low=True)
-        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, "V", open_low=True)
-        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, "V")
+        each = " per cell of the pack" if cell.pack_line else ""
+        least = check_number("current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, f"A{each}")
+        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, f"A{each}", open_low=True)
+        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}", open_low=True)
+        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}")
         if least >= most:
             raise ValueError(f"current_min_A = {least:g} must be less than current_max_A = {most:g}")
         if lowest >= highest:
@@ -92,6 +94,32 @@ class ChargingProblem:
             missing = [limit.name for limit in self.limits_by_name.values() if not known[limit.of]]
             if missing:
                 raise ValueError(f"{missing} cannot be measured on this cell: it has no [thermal] or [anode] table")
+        elif isinstance(self.plant, Circuit):
+            self._check_plant_cell(self.plant.cell)
+
+    def _check_plant_cell(self, plant: Cell) -> None:
+        """Whether the plant's circuit measures what the controller reads and what is limited."""
+        named = f"plant: the cell {plant.name!r}"
+        for table, limit in (("thermal", "temperature_max_K"), ("anode", "anode_min_V")):
+            if getattr(plant, table) is None and limit in self.limits_by_name:
+                raise ValueError(f"{named} has no table [{table}], and limits.{limit} = {self.limits_by_name[limit].bound:g} is of it")
+        if plant.thermal is None and self.cell.thermal is not None:
+            raise ValueError(f"{named} has no table [thermal], and the controller's cell has one: it reads the temperature")
+        if self.estimator.kind == "exact" and not set(self.cell.pairs) <= set(plant.pairs):
+            raise ValueError(
+                f"{named} has {len(plant.pairs)} R-C pairs; with estimator.kind = 'exact' allowed are at least the "
+                f"{len(self.cell.pairs)} of the controller's cell"
+            )
+        if (plant.series, plant.parallel) not in ((1, 1), (self.cell.series, self.cell.parallel)):
+            raise ValueError(
+                f"{named} is in a pack of {plant.series}s{plant.parallel}p, allowed is that of the controller's cell, "
+                f"{self.cell.series}s{self.cell.parallel}p"
+            )
+        resting, highest = float(np.interp(self.episode.soc_start, plant.ocv_soc, plant.ocv_V)), self.voltage_max_V
+        if resting >= highest:
+            raise ValueError(
+                f"{named} rests at {resting:.3f} V at soc_start = {self.episode.soc_start:g}, allowed is below voltage_max_V = {highest:g}"
+            )
 
     def _check_theta(self) -> None:
         theta, known = self.theta, ("R0", *(f"R{k}" for k in self.cell.pairs))
@@ -109,6 +137,15 @@ class ChargingProblem:
             own = self.estimator.settings.voltage_sd_V
             check_number("kalman: voltage_sd_V", own, theta.voltage_sd.lower_V, theta.voltage_sd.upper_V, "V, which theta.voltage_sd spans")
 
+        ramp = self.controller.current_ramp_A_s
+        if theta.current_ramp is not None:
+            low, high = theta.current_ramp.lower_A_s, theta.current_ramp.upper_A_s
+            if ramp is None:
+                raise ValueError(
+                    "theta.current_ramp is given without controller.current_ramp_A_s, allowed is the untuned ramp there, "
+                    f"in [{low:g}, {high:g}] A/s"
+                )
+            check_number("controller: current_ramp_A_s", ramp, low, high, "A/s, which theta.current_ramp spans")
         numbers = self._observer_numbers
         for part in theta.observer:
             if part.name not in numbers or isinstance(self.estimator.settings, Kalman):
@@ -135,7 +172,7 @@ class ChargingProblem:
     def _check_range(self) -> None:
         if self.range is None:
             return
-        if self.range.ambient_K is not None and self.cell.thermal is None:
+        if self.range.ambient_K is not None and (self.plant_cell or self.cell).thermal is None:
             raise ValueError(f"range: ambient_K = {list(self.range.ambient_K)}, allowed only for a cell with a [thermal] table")
         highest = self.range.soc_start[1] if self.range.soc_start else 0.0
         wanted = self.objective.charge_time_to_soc or self.episode.soc_target
@@ -165,6 +202,23 @@ class ChargingProblem:
         return self.limits.by_name(self.cell)
 
     @property
+    def plant_cell(self) -> Cell | None:
+        """The cell whose circuit is the plant: the problem's own, or that of a `Circuit`; None for any other plant."""
+        if self.plant is None:
+            return self.cell
+        return self.plant.cell if isinstance(self.plant, Circuit) else None
+
+    @property
+    def plant_line(self) -> str:
+        """What the plant is, in words."""
+        return "its own circuit, simulated" if self.plant is None else str(getattr(self.plant, "line", self.plant))
+
+    @property
+    def setting_lines(self) -> list[str]:
+        """What is not the usual case of one cell on its own circuit, in words: the plant, the pack."""
+        return [*([f"plant: {self.plant_line}"] if self.plant else []), *([self.cell.pack_line] if self.cell.pack_line else [])]
+
+    @property
     def controller_cell(self) -> Cell:
         """What the untuned controller believes of the cell."""
         seed = self.controller.mismatch_seed
@@ -173,7 +227,7 @@ class ChargingProblem:
     @property
     def space(self) -> ParameterSpace:
         """The space of theta."""
-        return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()))
+        return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()), self.controller.current_ramp_A_s)
 
     @property
     def _observer_numbers(self) -> dict[str, float]:
@@ -196,13 +250,23 @@ class ChargingProblem:
 
 
 @built_once(64)
-def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...]) -> ParameterSpace:
-    return theta.space(nodes, dict(observer))
+def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...], ramp_A_s: float | None) -> ParameterSpace:
+    return theta.space(nodes, dict(observer), ramp_A_s)
 
 
 def with_feedback(problem: ChargingProblem) -> ChargingProblem:
     """The same problem, untuned, with the observer that reads the voltage (`OffsetFree`) instead of its own."""
     return replace(problem, estimator=EstimatorSettings(kind="offset_free"), theta=Tunables(), safety=None)
+
+
+def knowing_the_plant(problem: ChargingProblem) -> ChargingProblem:
+    """The same problem, untuned, with a controller whose model is the plant's circuit (`ChargingProblem.plant_cell`); limits stay."""
+    own, cell = problem.cell, problem.plant_cell or problem.cell
+    # The limits are of the controller's cell; those of the plant's file were never in force.
+    names = ("current_max_A", "voltage_min_V", "voltage_max_V", "series", "parallel")
+    known = cell if cell is own else replace(cell, **{name: getattr(own, name) for name in names})
+    believed = replace(problem.controller, mismatch_seed=None)
+    return replace(problem, cell=known, plant=None, controller=believed, theta=Tunables())
 
 
 def judged_exactly(problem: ChargingProblem) -> ChargingProblem:

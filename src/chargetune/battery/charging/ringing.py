@@ -56,7 +56,7 @@ def check_ringing(problem: ChargingProblem) -> list[Finding]:
             "warning",
             f"the current swings from sample to sample {swings} times in a row ({name}); the voltage is {over:.1f} mV over its limit: "
             "the observer follows the voltage faster than the believed resistances allow",
-            "a smaller offset_drift_V or resistance_rate, a larger voltage_sd_V, the observer's defaults, or kind = 'adaptive'",
+            "a smaller offset_drift_V or resistance_drift, a larger voltage_sd_V, the observer's defaults, or kind = 'adaptive'",
             {"swings": float(swings), "voltage_over_mV": over},
             Evidence("time (min)", "current (A)", {name: (minutes, current)}),
         )

@@ -15,7 +15,7 @@ from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.model.splines import natural_spline, piecewise_linear
 
-__all__ = ["Backoff", "CurrentLimit", "LimitBackoff", "MeasurementSpread", "ObserverSetting", "ResistanceRatio", "Tunables"]
+__all__ = ["Backoff", "CurrentLimit", "CurrentRamp", "LimitBackoff", "MeasurementSpread", "ObserverSetting", "ResistanceRatio", "Tunables"]
 
 Resistance = Literal["R0", "R1", "R2", "R3"]
 RESISTANCES: tuple[Resistance, ...] = ("R0", "R1", "R2", "R3")
@@ -97,8 +97,9 @@ class ResistanceRatio:
     scale: bool = False
 
     def __post_init__(self) -> None:
-        check_number("resistance ratio: lower", self.lower, 0.001, 0.999)
-        check_number("resistance ratio: upper", self.upper, 1.001, 100.0)
+        # The untuned controller's own resistance lies between them.
+        check_number("resistance ratio: lower", self.lower, 0.001, 0.999, "below 1, the untuned ratio")
+        check_number("resistance ratio: upper", self.upper, 1.001, 100.0, "above 1, the untuned ratio")
         if not isinstance(self.scale, bool):
             raise ValueError(f"resistance ratio: scale = {self.scale!r}, allowed is true or false")
 
@@ -135,6 +136,24 @@ class CurrentLimit:
 
     def share(self, stage: Stage) -> Any:
         return piecewise_linear(ca.fmin(ca.fmax(stage.now["soc"], 0.0), 1.0), self.grid, stage.theta["current_limit"])
+
+
+@dataclass(frozen=True)
+class CurrentRamp:
+    """theta in the set U: by how much the current may rise per second, I_k <= I_{k-1} + ramp Ts, log scale.
+
+    Untuned it is the controller's own ``current_ramp_A_s``.
+    """
+
+    lower_A_s: float
+    upper_A_s: float
+
+    def __post_init__(self) -> None:
+        check_number("current ramp: lower_A_s", self.lower_A_s, 1e-6, 1e4, "A/s")
+        check_number("current ramp: upper_A_s", self.upper_A_s, self.lower_A_s, 1e4, "A/s", open_low=True)
+
+    def parameter(self, default_A_s: float) -> Parameter:
+        return Parameter("current_ramp_A_s", self.lower_A_s, self.upper_A_s, default_A_s, unit="A/s", scale="log")
 
 
 @dataclass(frozen=True)
@@ -188,6 +207,7 @@ class Tunables:
     R2: ResistanceRatio | None = None
     R3: ResistanceRatio | None = None
     current_limit: CurrentLimit | None = None
+    current_ramp: CurrentRamp | None = None
     temperature_backoff: LimitBackoff | None = None
     anode_backoff: LimitBackoff | None = None
     voltage_sd: MeasurementSpread | None = None
@@ -220,14 +240,15 @@ class Tunables:
         """Names of the filter's numbers that are tuned."""
         return (*(["voltage_sd_V"] if self.voltage_sd else []), *(part.name for part in self.observer))
 
-    def space(self, nodes: int, observer: Mapping[str, float]) -> ParameterSpace:
-        """The space of theta for a cell with so many SOC nodes and a filter with these numbers by name."""
+    def space(self, nodes: int, observer: Mapping[str, float], ramp_A_s: float | None) -> ParameterSpace:
+        """The space of theta for a cell with so many SOC nodes, a filter with these numbers by name, and this ramp of the current."""
         return ParameterSpace(
             (
                 *([self.backoff.parameter] if self.backoff else []),
                 *(part.parameter(of, nodes) for of, part in self.ratios.items()),
                 *(part.parameter(of) for of, part in self.limit_backoffs.items()),
                 *([self.current_limit.parameter] if self.current_limit else []),
+                *([self.current_ramp.parameter(ramp_A_s)] if self.current_ramp and ramp_A_s is not None else []),
                 *([self.voltage_sd.parameter(observer["voltage_sd_V"])] if self.voltage_sd else []),
                 *(part.parameter(observer[part.name]) for part in self.observer),
             )

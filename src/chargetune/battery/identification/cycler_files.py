@@ -1,181 +1,239 @@
-"""ReadStudy what battery cyclers write: one CSV table of time, current, voltage and, where there is one, temperature.
+"""ReadStudy what battery cyclers write: a table of time, current, voltage and, where there is one, temperature.
 
-Columns are found by name, as Bitrode, Arbin, Neware, BioLogic and the Battery Data Format (BDF) write them:
-
-| quantity | names (spaces, underscores and case do not matter) |
-|---|---|
-| time | Time(s), Test_Time(s), Test Time / s, test_time_second, time/s, Total Time, Record Time, Time(h:min:s.ms), Relative Time |
-| current | Current, Current(A), Current(mA), Current / A, current_ampere, Cur(mA), I/mA, <I>/mA, I/A |
-| voltage | Voltage, Voltage(V), Voltage(mV), Voltage / V, voltage_volt, Vol(V), Ecell/V, Ewe/V |
-| temperature | Temperature, Temperature(C), Temperature / degC, Surface Temperature / degC, Temp(C), T1/degC, Aux_Temperature_1(C) |
-
-A unit in the name is converted; without one it is s, A, V and degree Celsius; a clock (h:mm:ss) is understood. A time that
-restarts with each step is strung together. Semicolon, tab or comma separates; decimal commas and a byte order mark are
-understood. Current is positive when it charges; a file with the other sign is recognised by its voltage, which rises with
-a charging current. A temperature column with holes is left out.
+Columns are found by name and unit (`layouts`): text with any separator, decimal mark and encoding, Excel, Parquet. A clock
+(h:mm:ss), a date, a clock of each step are understood. Current is positive when it charges; a file with the other sign is
+recognised by its states or by its voltage, which rises with a charging current. Where a file can be read in two ways it is
+refused, with the option that decides, or what was assumed is among the remarks. The page docs/cycler-files.md has it all.
 """
 
 from __future__ import annotations
 
-import csv
-import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.identification.record import Record, checked
+from chargetune.battery.cell.cell import PACK, PACK_MAX
+from chargetune.battery.identification.cells import clock_seconds, dates, decimal_mark, number
+from chargetune.battery.identification.clocks import Clock, elapsed
+from chargetune.battery.identification.current_sign import Sign, signed_by_state
+from chargetune.battery.identification.headings import Column, unit_of
+from chargetune.battery.identification.layouts import NEEDED, UNITS
+from chargetune.battery.identification.plausibility import checked
+from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.samples import Samples, read_samples
+from chargetune.battery.validation import check_count
 
-__all__ = ["read_record"]
+__all__ = ["Reading", "read_record"]
 
-NAMES: dict[str, tuple[str, ...]] = {
-    "time": ("testtime", "testtimesecond", "totaltime", "recordtime", "time", "relativetime"),
-    "current": ("current", "currentampere", "cur", "<i>", "i"),
-    "voltage": ("voltage", "voltagevolt", "vol", "ecell", "<ewe>", "ewe", "v"),
-    "temperature": ("temperature", "temp", "t1", "temperaturet1", "surfacetemperature", "auxtemperature1", "auxtemp1"),
-}
-CLOCKS = dict.fromkeys(("h:min:s.ms", "h:m:s", "h:mm:ss", "hh:mm:ss", "hh:mm:ss.ms"), 1.0)
-UNITS: dict[str, dict[str, float]] = {
-    "time": {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, **CLOCKS},
-    "current": {"": 1.0, "a": 1.0, "ma": 1e-3},
-    "voltage": {"": 1.0, "v": 1.0, "mv": 1e-3},
-    "temperature": {"": 1.0, "c": 1.0, "degc": 1.0, "°c": 1.0, "k": 1.0},
-}
-NEEDED = ("time", "current", "voltage")
 ZERO_CELSIUS_K = 273.15
-# A step's clock that restarts begins at most here, s, or at most at this share of the time before.
-RESTART_S, RESTART_SHARE = 1.0, 0.1
-RESTART_MAX_S = 60.0
-# Steps end and begin with two samples at one time; more of them are damage.
-STANDS_SHARE = 0.05
-HEADER_LINES = 200
-
-# quantity -> (column, factor to SI, its name in the file)
-Columns = dict[str, tuple[int, float, str]]
+# A temperature column beyond these, degree Celsius, is no cell's; one without a unit that stays within the others is in kelvin.
+CELSIUS_RANGE, KELVIN_RANGE = (-80.0, 200.0), (223.0, 400.0)
+# Without a unit a voltage beyond this is in mV, and a current beyond this may be in mA.
+MILLIVOLTS_FROM, AMPERES_TO = 100.0, 100.0
+# Dates and clock of one file differ by less than this share.
+DATES_SHARE = 0.02
 
 
-def read_record(path: str | Path) -> Record:
+@dataclass(frozen=True)
+class Reading:
+    """What a file leaves open: ``sign`` of its current, ``time_unit`` (s, ms, min, h, hh:mm, mm:ss), ``current_unit`` (A, mA).
+
+    ``series`` and ``parallel``: it was measured on a pack of so many cells, and the record is that of one of them.
+    """
+
+    sign: Sign | None = None
+    time_unit: str | None = None
+    current_unit: str | None = None
+    series: int = 1
+    parallel: int = 1
+
+    def __post_init__(self) -> None:
+        if self.sign not in {None, "charge", "discharge", "unsigned"}:
+            raise ValueError(f"sign = {self.sign!r}, allowed are charge, discharge and unsigned")
+        for count in PACK:
+            check_count(count, getattr(self, count), 1, PACK_MAX)
+        for name, quantity in (("time_unit", "time"), ("current_unit", "current")):
+            unit = getattr(self, name)
+            if unit is not None and unit_of(unit) not in {*UNITS[quantity], "hh:mm", "mm:ss"} - {""}:
+                allowed = "s, ms, min, h, d, hh:mm and mm:ss" if quantity == "time" else "A, mA and uA"
+                raise ValueError(f"{name} = {unit!r}, allowed are {allowed}")
+
+
+def read_record(path: str | Path, reading: Reading | None = None) -> Record:
     """Read one file. Raises FileNotFoundError, and ValueError that names file, row or column, value and what is allowed."""
-    name = Path(path).name
-    lines = _text(Path(path)).splitlines()
-    if not any(line.strip() for line in lines):
-        raise ValueError(f"{name} is empty")
-    rows, at, columns = _header(name, lines)
-    remarks: list[str] = []
-    arrays = _numbers(name, rows, at, columns, remarks)
-    if len(arrays["time"]) < 2:
-        raise ValueError(f"{name} has {len(arrays['time'])} rows of numbers, allowed are at least 2")
-    warm = arrays.get("temperature")
-    if warm is not None and not columns["temperature"][2].lower().rstrip(") ]").endswith(("/k", "(k", "/ k", "[k")):
-        warm = warm + ZERO_CELSIUS_K
-    time = _strung(name, arrays["time"], remarks)
-    return checked(Record(name, time, arrays["current"], arrays["voltage"], warm, tuple(remarks)))
-
-
-def _text(path: Path) -> str:
-    content = path.read_bytes()
-    for encoding in ("utf-8-sig", "utf-16") if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252"):
-        try:
-            return content.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-    raise ValueError(f"{path.name} is not text")
-
-
-def _header(name: str, lines: list[str]) -> tuple[list[list[str]], int, Columns]:
-    """(rows, row of the header, columns), with the separator that shows a header; cyclers write some lines before it."""
-    best: Columns = {}
-    for delimiter in ";\t,":
-        try:
-            rows = list(csv.reader(lines, delimiter=delimiter))
-        except csv.Error as error:
-            raise ValueError(f"{name} is no table of text: {error}") from error
-        for at, row in enumerate(rows[:HEADER_LINES]):
-            found = _columns(row)
-            if set(NEEDED) <= set(found):
-                return rows, at, found
-            best = max(best, found, key=len)
-    missing = [quantity for quantity in NEEDED if quantity not in best]
-    raise ValueError(
-        f"{name} has no column for {', '.join(missing)}; its first row is: {lines[0].strip()[:200]}. "
-        "Known names and units: see chargetune.battery.identification.cycler_files"
-    )
-
-
-def _columns(row: list[str]) -> Columns:
-    found: Columns = {}
-    rank: dict[str, int] = {}
-    for index, cell in enumerate(row):
-        # "Test Time / s", "Current(A)", "I/mA" are a name and a unit.
-        plain = re.sub(r"[\s_]", "", cell).lower()
-        match = re.fullmatch(r"(.+?)(?:[(\[/]([^)\]]*)[)\]]?)?", plain)
-        if not match:
-            continue
-        label, unit = match.group(1), match.group(2) or ""
-        for quantity, names in NAMES.items():
-            if label in names and unit in UNITS[quantity] and names.index(label) < rank.get(quantity, len(names)):
-                rank[quantity] = names.index(label)
-                found[quantity] = (index, UNITS[quantity][unit], cell.strip())
-    return found
-
-
-def _numbers(name: str, rows: list[list[str]], at: int, columns: Columns, remarks: list[str]) -> dict[str, NDArray[np.float64]]:
-    table: dict[str, list[float]] = {quantity: [] for quantity in columns}
-    marks: set[str] = set()
-    for number, row in enumerate(rows[at + 1 :], start=at + 2):
-        if not any(cell.strip() for cell in row):
-            continue
-        if any(cell.strip() for cell in row[len(rows[at]) :]):
-            raise ValueError(
-                f"{name}, row {number} has {len(row)} cells, allowed are {len(rows[at])} as in the header "
-                "(decimal commas need semicolons or tabs between columns)"
-            )
-        for quantity in list(table):
-            index, factor, label = columns[quantity]
-            cell = row[index].strip() if index < len(row) else ""
-            marks |= {mark for mark in ",." if mark in cell and ":" not in cell}
-            if len(marks) > 1:
-                raise ValueError(f"{name}, row {number}: {label} = {cell!r}, but other numbers have the other decimal mark; allowed is one")
-            try:
-                table[quantity].append(_value(cell, factor))
-            except ValueError as error:
-                where = f"row {number}: {label} = {cell!r}, allowed is {error}"
-                if quantity in NEEDED:
-                    raise ValueError(f"{name}, {where}") from None
-                remarks.append(f"the temperature was left out ({where})")
-                del table[quantity]
-    return {quantity: np.array(values) for quantity, values in table.items()}
-
-
-def _value(cell: str, factor: float) -> float:
-    """The number in SI; a clock is in s whatever the unit. Raises ValueError with what is allowed."""
-    clock = re.fullmatch(r"(?:(\d+)-)?(\d+):(\d\d?):(\d\d?(?:[.,]\d+)?)", cell)
-    if clock:
-        days, hours, minutes, seconds = clock.groups()
-        return 86400.0 * int(days or 0) + 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
+    options, name = reading or Reading(), Path(path).name
+    samples = read_samples(Path(path))
+    remarks, assumed = list(samples.remarks), list[str]()
+    columns = _decided(samples.columns, options, remarks)
+    source = next(q for q in ("time", "step_time", "date") if q in columns)
+    numeric = [q for q in ("current", "voltage", "counter", "temperature") if q in columns]
     try:
-        value = float(cell.replace(",", "."))
+        mark = decimal_mark({columns[q].heading: samples.cells[q] for q in (*((source,) if source != "date" else ()), *numeric)})
+    except ValueError as found:
+        heading, row, cell = str(found).split("|", 2)
+        where = f"{name}, row {samples.numbers[int(row)]}"
+        raise ValueError(f"{where}: {heading} = {cell!r}, but other numbers have the other decimal mark; allowed is one") from None
+    arrays: dict[str, NDArray[np.float64]] = {}
+    for quantity in numeric:
+        column = columns[quantity]
+        try:
+            arrays[quantity] = column.factor * np.array(_numbers(samples, quantity, mark))
+        except ValueError as error:
+            if quantity in NEEDED:
+                raise
+            remarks.append(f"the temperature was left out ({str(error).removeprefix(name + ', ')})")
+    if (options.series, options.parallel) != (1, 1):
+        for quantity, count in (("voltage", options.series), ("counter", options.series), ("current", options.parallel)):
+            if quantity in arrays:
+                arrays[quantity] = arrays[quantity] / count
+        remarks.append(f"of a pack: voltage was divided by {options.series} in series, current by {options.parallel} in parallel")
+    _units(name, columns, arrays, assumed)
+    raw, of_day = _time(samples, columns[source], mark, assumed, remarks)
+    current = arrays["current"]
+    if len(current) < 2:
+        raise ValueError(f"{name} has {len(current)} rows of numbers, allowed are at least 2")
+    known = False
+    if "state" in columns and options.sign is None:
+        signed = signed_by_state(name, current, samples.cells["state"], remarks)
+        known, current = signed is not current, signed
+    voltage = arrays["voltage"]
+    if "counter" in arrays and columns["voltage"].heading.lower().startswith("ewe") and "-" not in columns["voltage"].heading:
+        voltage = voltage - arrays["counter"]
+        remarks.append(f"voltage is {columns['voltage'].heading} minus {columns['counter'].heading}, between the two electrodes")
+    step = np.unique(samples.cells["step"], return_inverse=True)[1] if "step" in columns else None
+    time, keep = elapsed(name, Clock(raw, current, step, of_steps=source == "step_time", of_day=of_day), remarks)
+    _compared(name, samples, columns, source, time, keep, remarks)
+    warm = _kelvin(columns, arrays, assumed, remarks)
+    record = Record(name, time, current[keep], voltage[keep], None if warm is None else warm[keep], tuple(remarks))
+    try:
+        record = checked(record, sign=options.sign, known_sign=known)
+    except ValueError as error:
+        raise ValueError("; ".join([str(error), *assumed])) from None
+    return replace(record, remarks=(*record.remarks, *assumed, *_not_used(samples, columns)))
+
+
+def _decided(columns: dict[str, Column], options: Reading, remarks: list[str]) -> dict[str, Column]:
+    """The columns with the units that the person gave."""
+    decided = dict(columns)
+    for unit, quantities in ((options.time_unit, ("time", "step_time")), (options.current_unit, ("current",))):
+        for quantity in quantities:
+            if unit is not None and quantity in decided:
+                decided[quantity] = replace(decided[quantity], unit=unit_of(unit))
+                remarks.append(f"{decided[quantity].heading} is in {unit}, as the option says")
+    return decided
+
+
+def _numbers(samples: Samples, quantity: str, mark: str) -> list[float]:
+    values, column = [], samples.columns[quantity]
+    for row, cell in zip(samples.numbers, samples.cells[quantity], strict=True):
+        try:
+            values.append(number(cell, mark))
+        except ValueError as error:
+            raise ValueError(f"{samples.name}, row {row}: {column.heading} = {cell!r}, allowed is {error}") from None
+    return values
+
+
+def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remarks: list[str]) -> tuple[NDArray[np.float64], bool]:
+    """(time as logged in s, whether it is a clock of hours that may stop at 24)."""
+    cells = samples.cells[column.quantity]
+    # A date has its day before the hour, with signs that no clock has.
+    moments = dates(cells) if cells and (column.quantity == "date" or any(sign in cells[0] for sign in "-/.")) else None
+    if moments is not None and (column.quantity == "date" or not _is_clock(cells[0], column.unit)):
+        try:
+            order, seconds = moments.best()
+        except ValueError as error:
+            raise ValueError(f"{samples.name}: {column.heading} = {cells[0]!r} to {cells[-1]!r}, allowed are {error}") from None
+        remarks.append(
+            f"time is from the dates in {column.heading} ({ {'ymd': 'year, month, day', 'mdy': 'month, day, year', 'dmy': 'day, month, year'}[order] })"
+        )
+        return seconds, False
+    values, clocks = [], 0
+    for row, cell in zip(samples.numbers, cells, strict=True):
+        try:
+            clock = clock_seconds(cell, column.unit) if ":" in cell else None
+            clocks += clock is not None
+            values.append(column.factor * number(cell, mark) if clock is None else clock)
+        except ValueError as error:
+            raise ValueError(f"{samples.name}, row {row}: {column.heading} = {cell!r}, allowed is {error}") from None
+    if not column.unit and clocks < len(values):
+        assumed.append(f"{column.heading} has no unit: s was assumed (--time-unit decides)")
+    return np.array(values), clocks == len(values)
+
+
+def _is_clock(cell: str, unit: str) -> bool:
+    try:
+        return clock_seconds(cell, unit) is not None
     except ValueError:
-        raise ValueError("a number") from None
-    if not np.isfinite(value):
-        raise ValueError("a finite number")
-    return factor * value
+        return True
 
 
-def _strung(name: str, time: NDArray[np.float64], remarks: list[str]) -> NDArray[np.float64]:
-    """Time that increases: a step whose clock restarts begins where the one before ended."""
-    steps = np.diff(time)
-    falls = np.flatnonzero(steps < 0)
-    for k in falls.tolist():
-        # A clock that restarts begins near zero; another one that falls is damage.
-        if not 0 <= time[k + 1] <= max(RESTART_S, min(RESTART_SHARE * time[k], RESTART_MAX_S)):
-            raise ValueError(f"{name}, sample {k + 2}: time = {time[k + 1]:g} s after {time[k]:g} s, allowed is an increasing time")
-        steps[k] = time[k + 1]
-    if falls.size:
-        remarks.append(f"the clock restarts {falls.size} times (once a step); the steps were strung together")
-    stands = steps == 0
-    stands[falls] = False
-    if np.mean(stands) > STANDS_SHARE:
-        k = int(np.argmax(stands))
-        raise ValueError(f"{name}, sample {k + 2}: time stands at {time[k]:g} s in {np.sum(stands)} samples, allowed is an increasing time")
-    return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]), dtype=np.float64)
+def _units(name: str, columns: dict[str, Column], arrays: dict[str, NDArray[np.float64]], assumed: list[str]) -> None:
+    """Settle units that the headings leave open by what a single cell can have, and tell it."""
+    if not columns["voltage"].unit and len(arrays["voltage"]):
+        heading = columns["voltage"].heading
+        if np.median(np.abs(arrays["voltage"])) > MILLIVOLTS_FROM:
+            arrays["voltage"] = 1e-3 * arrays["voltage"]
+            assumed.append(f"{heading} has no unit: mV was assumed")
+        else:
+            assumed.append(f"{heading} has no unit: V was assumed")
+    if not columns["current"].unit and len(arrays["current"]):
+        heading, largest = columns["current"].heading, float(np.max(np.abs(arrays["current"])))
+        if largest > AMPERES_TO:
+            raise ValueError(f"{name}: {heading} has no unit and reaches {largest:g}, which can be A or mA; --current-unit decides")
+        assumed.append(f"{heading} has no unit: A was assumed (--current-unit decides)")
+
+
+def _kelvin(
+    columns: dict[str, Column], arrays: dict[str, NDArray[np.float64]], assumed: list[str], remarks: list[str]
+) -> NDArray[np.float64] | None:
+    values = arrays.get("temperature")
+    if values is None or not len(values):
+        return None
+    unit, heading = columns["temperature"].unit, columns["temperature"].heading
+    if not unit:
+        kelvin = KELVIN_RANGE[0] < np.min(values) and np.max(values) < KELVIN_RANGE[1]
+        unit = "k" if kelvin else "c"
+        assumed.append(f"{heading} has no unit: {'kelvin' if kelvin else 'degree Celsius'} was assumed")
+    celsius = values - ZERO_CELSIUS_K if unit.startswith("k") else (values - 32) / 1.8 if unit.endswith("f") else values
+    if not (CELSIUS_RANGE[0] < np.min(celsius) and np.max(celsius) < CELSIUS_RANGE[1]):
+        remarks.append(f"the temperature was left out ({heading} reaches {np.min(celsius):.4g} to {np.max(celsius):.4g} degC)")
+        return None
+    return np.asarray(celsius + ZERO_CELSIUS_K, dtype=np.float64)
+
+
+def _compared(
+    name: str,
+    samples: Samples,
+    columns: dict[str, Column],
+    source: str,
+    time: NDArray[np.float64],
+    keep: NDArray[np.bool_],
+    remarks: list[str],
+) -> None:
+    """Compare the clock with the dates of the file, where it has both: another unit is refused, another span is told."""
+    if source == "date" or "date" not in columns or not time[-1]:
+        return
+    moments = dates([cell for cell, kept in zip(samples.cells["date"], keep, strict=True) if kept])
+    spans = [] if moments is None else [float(seconds[-1]) for seconds in moments.by_order.values() if np.all(np.diff(seconds) >= 0)]
+    if not spans:
+        return
+    span = min(spans, key=lambda seconds: abs(seconds - time[-1]))
+    # Dates are written in whole seconds or minutes.
+    if abs(span - time[-1]) <= max(DATES_SHARE * time[-1], 120.0):
+        return
+    seen = f"the clock {columns[source].heading} spans {time[-1]:.6g} s, the dates in {columns['date'].heading} {span:.6g} s"
+    if not columns[source].unit and ":" not in samples.cells[source][0]:
+        raise ValueError(f"{name}: {seen}; {columns[source].heading} has no unit, --time-unit decides")
+    remarks.append(f"{seen}; the clock was taken")
+
+
+def _not_used(samples: Samples, columns: dict[str, Column]) -> Sequence[str]:
+    notes = []
+    for quantity in ("current", "voltage", "temperature"):
+        rest = [column.heading for column in samples.others.get(quantity, [])]
+        if rest:
+            notes.append(f"{quantity} is {columns[quantity].heading}; not used: {', '.join(rest)}")
+    return notes

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.identification.pulses import PulseSet, groups, segments
-from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.pulses import PulseSet, groups
+from chargetune.battery.identification.record import Record, segments
 
 __all__ = ["ocv_from_rests", "ocv_from_slow"]
 

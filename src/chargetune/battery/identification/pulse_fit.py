@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares, nnls
 
-from chargetune.battery.cell.cell import CAPACITY_MAX_AH, VOLTAGE_ABOVE_FULL_V, Cell
+from chargetune.battery.cell.cell import CAPACITY_MAX_AH, RESISTANCE_MAX_V, Cell, highest_voltage
 from chargetune.battery.cell.equivalent_circuit import ecm_model
 from chargetune.battery.identification.open_circuit import ocv_from_rests, ocv_from_slow
 from chargetune.battery.identification.pulses import PULSE_MAX_S, REST_MIN_S, PulseSet, find_pulse_sets, groups
@@ -25,7 +25,8 @@ __all__ = ["Identification", "PulseFit", "cell_toml", "identify", "predicted_vol
 
 # Time constants that pulses of some ten seconds can tell, s: the first pair, and both where there are two.
 TIME_CONSTANTS_S = {1: ((0.5, 400.0),), 2: ((0.5, 30.0), (15.0, 1000.0))}
-RESISTANCES_OHM = (1e-7, 1.0)
+# Least and largest voltage of a resistance at 1C.
+RESISTANCES_V = (1e-6, RESISTANCE_MAX_V)
 # A standard deviation of more than this share says that the data do not hold the parameter.
 SPREAD_MAX = 1.0
 GRID = 12
@@ -96,7 +97,7 @@ def identify(
         remarks.append(f"capacity {capacity:.4g} Ah is the charge between the fullest and the emptiest point of the record")
     grid, volts = ocv_from_rests(record, sets, soc) if ocv is None else ocv_from_slow(ocv, capacity, remarks)
     curve = PchipInterpolator(grid, volts, extrapolate=True)
-    fits = [_fit(record, part, soc, curve, rc) for part in sets]
+    fits = [_fit(record, part, soc, curve, rc, capacity) for part in sets]
     least, most = (pick(fit.soc for fit in fits) for pick in (min, max))
     if least > UNCOVERED_TOLD or most < 1 - UNCOVERED_TOLD:
         remarks.append(f"the pulses reach from SOC {least:.2f} to {most:.2f}; beyond, the circuit is that of the nearest of them")
@@ -117,7 +118,7 @@ def _response(t: NDArray[np.float64], current: NDArray[np.float64], tau: float) 
     return out
 
 
-def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, rc: int) -> PulseFit:
+def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, rc: int, capacity_Ah: float) -> PulseFit:
     pulses = part.of(record)
     t, current, z = pulses.time_s - pulses.time_s[0], pulses.current_A, soc[part.first : part.last]
     # What the OCV itself moves during the pulses is known; its level is measured just before them.
@@ -132,8 +133,9 @@ def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, r
 
     ranges = TIME_CONSTANTS_S[rc]
     start = _start(t, current, overpotential, ranges)
+    ohms = RESISTANCES_V[0] / capacity_Ah, RESISTANCES_V[1] / capacity_Ah
     names = ["R0_ohm", *(name for k in range(1, rc + 1) for name in (f"R{k}_ohm", f"tau{k}_s"))]
-    bounds = dict(zip(names, (RESISTANCES_OHM, *(pair for taus in ranges for pair in (RESISTANCES_OHM, taus))), strict=True))
+    bounds = dict(zip(names, (ohms, *(pair for taus in ranges for pair in (ohms, taus))), strict=True))
     lower, upper = (np.append(np.log([pair[end] for pair in bounds.values()]), OFFSET_MAX_MV * (2 * end - 1)) for end in (0, 1))
     found = least_squares(
         lambda x: model(x) - overpotential, np.clip(np.append(start, 0.0), lower + 1e-6, upper - 1e-6), bounds=(lower, upper), x_scale=1.0
@@ -150,7 +152,7 @@ def _fit(record: Record, part: PulseSet, soc: NDArray[np.float64], curve: Any, r
             )
         if min(found.x[i] - lower[i], upper[i] - found.x[i]) < AT_BOUND:
             raise ValueError(
-                f"{place}: the data do not hold {label}; its fit ends at {np.exp(found.x[i]):.3g}, allowed is {least:g} to {most:g}; "
+                f"{place}: the data do not hold {label}; its fit ends at {np.exp(found.x[i]):.3g}, allowed is {least:.3g} to {most:.3g}; "
                 f"{'faster sampling' if found.x[i] - lower[i] < AT_BOUND else 'longer pulses'}"
                 f"{' or --rc 1' if rc == 2 else ''} would"
             )
@@ -209,7 +211,7 @@ def _cell(
         coulombic_efficiency=1.0,
         current_max_A=float(np.max(np.abs(record.current_A))),
         voltage_min_V=round(min(lowest, float(ocv[1][0])), 3),
-        voltage_max_V=min(highest, np.floor(1e3 * (ocv[1][-1] + VOLTAGE_ABOVE_FULL_V)) / 1e3),
+        voltage_max_V=min(highest, np.floor(1e3 * highest_voltage(float(ocv[1][-1]))) / 1e3),
         soc=tuple(float(np.mean([ordered[i].soc for i in group])) for group in near),
         ocv_soc=tuple(float(z) for z in ocv[0]),
         ocv_V=tuple(float(v) for v in ocv[1]),
@@ -236,6 +238,8 @@ def cell_toml(cell: Cell, notes: Sequence[str] = ()) -> str:
         f"{key} = {getattr(cell, key):.7g}"
         for key in ("capacity_Ah", "coulombic_efficiency", "current_max_A", "voltage_min_V", "voltage_max_V")
     ]
+    if (cell.series, cell.parallel) != (1, 1):
+        lines += [f"series = {cell.series} # cells of the pack; every number here is of one cell", f"parallel = {cell.parallel}"]
     lines += ["", "[ecm] # over SOC: ohm, farad", f"soc = {row(cell.soc)}"]
     lines += [f"{key} = {row(getattr(cell, key))}" for key in cell.tables]
     lines += ["", "[ocv] # open-circuit voltage, V", f"soc = {row(cell.ocv_soc)}", f"V = {row(cell.ocv_V)}"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.identification.record import Record
+from chargetune.battery.identification.record import Record, segments
 
-__all__ = ["PULSE_MAX_S", "REST_MIN_S", "PulseSet", "find_pulse_sets", "groups", "segments"]
+__all__ = ["PULSE_MAX_S", "REST_MIN_S", "PulseSet", "find_pulse_sets", "groups"]
 
 # A rest at least this long leaves the cell relaxed, s.
 REST_MIN_S = 600.0
@@ -31,13 +30,6 @@ class PulseSet:
 
     def of(self, record: Record) -> Record:
         return record.part(self.first, self.last)
-
-
-def segments(record: Record) -> list[tuple[int, int, int]]:
-    """(first, last not included, sign of the current) of each stretch of rest (0), charge (1) and discharge (-1)."""
-    sign: NDArray[np.int64] = (np.sign(record.current_A) * (np.abs(record.current_A) > record.rest_A)).astype(np.int64)
-    edges = [0, *(np.flatnonzero(np.diff(sign)) + 1).tolist(), len(sign)]
-    return [(a, b, int(sign[a])) for a, b in pairwise(edges)]
 
 
 def find_pulse_sets(record: Record) -> list[PulseSet]:

@@ -1,25 +1,19 @@
-"""A measurement of one cell over time, and what makes it unfit for use."""
+"""A measurement of one cell over time, and its stretches of rest, charge and discharge."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Record", "checked"]
+__all__ = ["JUMP_SHARE", "Record", "segments"]
 
-# A single cell in V; what is beyond was another unit, a pack or a lost contact.
-VOLTAGE_RANGE_V = (0.0, 10.0)
-CURRENT_MAX_A = 2000.0
-# Longest time between two samples where a current flows at either, s: the charge of a longer one is unknown.
-GAP_MAX_S = 300.0
 # Below this share of the largest current a cell rests.
 REST_SHARE = 0.02
 # A change of current of more than this share of the largest one is a jump.
 JUMP_SHARE = 0.2
-# Share of the jumps that a voltage may answer the other way before the sign of the current is in doubt.
-DOUBT_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -69,78 +63,8 @@ class Record:
         return Record(self.source, self.time_s[first:last], self.current_A[first:last], self.voltage_V[first:last], warm, self.remarks)
 
 
-def checked(record: Record) -> Record:
-    """The record with the sign of its current settled and its rests ended where the current began.
-
-    Refuses (ValueError) what is no cell's voltage, no current, a gap with current, and a current without a sign.
-    """
-    _refuse_nonsense(record)
-    if _discharge_positive(record):
-        note = "current was positive when discharging; its sign was changed"
-        record = replace(record, current_A=-record.current_A, remarks=(*record.remarks, note))
-    return _with_ends_of_rests(record)
-
-
-def _refuse_nonsense(record: Record) -> None:
-    low, high = VOLTAGE_RANGE_V
-    outside = ~((record.voltage_V > low) & (record.voltage_V <= high))
-    if outside.any():
-        k = int(np.argmax(outside))
-        raise ValueError(
-            f"{record.source}, sample {k + 1}: voltage is {record.voltage_V[k]:g} V, allowed is {low:g} to {high:g} V "
-            "(was it given in mV? is it a pack?)"
-        )
-    largest = float(np.max(np.abs(record.current_A)))
-    if not 0 < largest <= CURRENT_MAX_A:
-        raise ValueError(
-            f"{record.source}: the largest current is {largest:g} A, allowed is more than 0 and at most {CURRENT_MAX_A:g} A (mA?)"
-        )
-    flowing = np.abs(record.current_A) > record.rest_A
-    gap = (np.diff(record.time_s) > GAP_MAX_S) & (flowing[1:] | flowing[:-1])
-    if gap.any():
-        k = int(np.argmax(gap))
-        seconds = record.time_s[k + 1] - record.time_s[k]
-        raise ValueError(
-            f"{record.source}, sample {k + 2}: a gap of {seconds:.0f} s with current, allowed is {GAP_MAX_S:g} s; its charge is unknown"
-        )
-
-
-def _discharge_positive(record: Record) -> bool:
-    """Whether the voltage falls where the current jumps up or, in a record without a jump, while a positive current flows."""
-    change, answer = np.diff(record.current_A), np.diff(record.voltage_V)
-    large = np.abs(change) > JUMP_SHARE * np.max(np.abs(record.current_A))
-    if not large.any():
-        return bool(np.sum(record.current_A[1:] * answer) < 0)
-    products = (change * answer)[large]
-    up, down = float(np.sum(products[products > 0])), -float(np.sum(products[products < 0]))
-    if min(up, down) > DOUBT_SHARE * (up + down):
-        raise ValueError(
-            f"{record.source}: the voltage rises with the current in {np.sum(products > 0)} jumps and falls in {np.sum(products < 0)}; "
-            "needed is a current with a sign, positive when it charges (some cyclers write it without)"
-        )
-    return down > up
-
-
-def _with_ends_of_rests(record: Record) -> Record:
-    """The record with one more sample at the end of each rest that was logged too seldom to show when the current began.
-
-    A step's first sample comes one logging interval after its start, so the rest lasted until then.
-    """
-    steps = np.diff(record.time_s)
-    flowing = np.abs(record.current_A) > record.rest_A
-    late = np.flatnonzero(~flowing[:-2] & flowing[1:-1] & flowing[2:] & (steps[1:] > 0) & (steps[:-1] > 2 * steps[1:]))
-    if not late.size:
-        return record
-    begins = record.time_s[late + 1] - steps[late + 1]
-
-    def longer(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.insert(values, late + 1, values[late])
-
-    return replace(
-        record,
-        time_s=np.insert(record.time_s, late + 1, begins),
-        current_A=longer(record.current_A),
-        voltage_V=longer(record.voltage_V),
-        temperature_K=None if record.temperature_K is None else longer(record.temperature_K),
-        remarks=(*record.remarks, f"{late.size} rests have no sample at their end; each was taken to last until its current began"),
-    )
+def segments(record: Record) -> list[tuple[int, int, int]]:
+    """(first, last not included, sign of the current) of each stretch of rest (0), charge (1) and discharge (-1)."""
+    sign: NDArray[np.int64] = (np.sign(record.current_A) * (np.abs(record.current_A) > record.rest_A)).astype(np.int64)
+    edges = [0, *(np.flatnonzero(np.diff(sign)) + 1).tolist(), len(sign)]
+    return [(a, b, int(sign[a])) for a, b in pairwise(edges)]

@@ -8,17 +8,20 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from chargetune.battery.plants.parameter_sets import OTHER_SETS, SETS
 from chargetune.battery.validation import check_number
 from chargetune.model.model import Signal
 from chargetune.plants.plant import Measurement, PlantError, SetUpError
@@ -51,7 +54,7 @@ class Electrochemical:
     """An electrochemical cell model with one lumped temperature, SEI growth and lithium plating, each where the parameter set has it.
 
     parameters
-        Name of a PyBaMM parameter set, or path of a BPX file (``.json``), which has no side reactions.
+        Name of a PyBaMM parameter set (`SETS`), or path of a BPX file (``.json``), which has no side reactions.
     ambient_K, cooling_W_m2K
         Temperature of the surroundings and of the cell at its start; heat transfer coefficient over the cooling surface.
     capacity_scale
@@ -64,13 +67,19 @@ class Electrochemical:
     Source: Marquis et al., J. Electrochem. Soc. 166 (2019) A3693 (models); O'Kane et al., PCCP 24 (2022) 7909 (default set).
     """
 
-    model: Literal["SPM", "SPMe", "DFN"] = "DFN"
-    parameters: str = "OKane2022"
-    ambient_K: float = 298.15
-    cooling_W_m2K: float = 10.0
-    capacity_scale: float = 1.0
-    resistance_scale: float = 1.0
-    mesh: Literal["coarse", "default"] = "coarse"
+    model: Annotated[
+        Literal["SPM", "SPMe", "DFN"], Field(description="Single-particle model, the same with electrolyte, or Doyle-Fuller-Newman.")
+    ] = "DFN"
+    parameters: Annotated[
+        str, Field(description="Name of a parameter set of PyBaMM, or a BPX file (.json), relative to the study file.")
+    ] = "OKane2022"
+    ambient_K: Annotated[float, Field(description="Temperature of the surroundings and of the cell at its start, K; 230 to 350.")] = 298.15
+    cooling_W_m2K: Annotated[float, Field(description="Heat transfer coefficient over the cooling surface, W/m2K; 0 to 1e4.")] = 10.0
+    capacity_scale: Annotated[float, Field(description="Share of active material that is left, 1; 0.3 to 1.5.")] = 1.0
+    resistance_scale: Annotated[float, Field(description="Factor on the ohmic resistance at half charge, 1; 1 to 10.")] = 1.0
+    mesh: Annotated[
+        Literal["coarse", "default"], Field(description="Points of the mesh: 10, 6, 10 and 10 in each particle, or PyBaMM's own.")
+    ] = "coarse"
 
     def __post_init__(self) -> None:
         for name, allowed in (("model", ("SPM", "SPMe", "DFN")), ("mesh", ("coarse", "default"))):
@@ -89,6 +98,19 @@ class Electrochemical:
     def plant(self, soc_start: float, sampling_time_s: float, sensors: Sensors) -> ElectrochemicalPlant:
         """A new plant at rest at this SOC."""
         return ElectrochemicalPlant(self, soc_start, sampling_time_s, sensors)
+
+    @property
+    def file(self) -> str:
+        """Path of the BPX file; empty for a named set."""
+        return self.parameters if Path(self.parameters).suffix.lower() == ".json" else ""
+
+    @property
+    def line(self) -> str:
+        """What it is, in words."""
+        shown = Path(self.file).name or self.parameters
+        changed = [f"{name} {value:g}" for name in ("capacity_scale", "resistance_scale") if (value := getattr(self, name)) != 1.0]
+        cooled = f"{self.ambient_K:g} K ambient, cooled with {self.cooling_W_m2K:g} W/m2K"
+        return ", ".join([f"{self.model} of PyBaMM with the parameters {shown}", cooled, *changed])
 
     @property
     def capacity_Ah(self) -> float:
@@ -260,8 +282,8 @@ def _discretised(settings: Electrochemical, soc_start: float, values: Any) -> _B
         contact = (settings.resistance_scale - 1.0) * float(charged[0] - rest[0])
     else:
         contact = 0.0
-    # Without the data of a lumped temperature (Prada2013) the cell stays at its ambient one.
-    options = {"thermal": "lumped" if THERMAL in values else "isothermal", "contact resistance": "true"}
+    # Without the data of a lumped temperature (Prada2013, Ramadass2004) the cell stays at its ambient one.
+    options = {"thermal": "lumped" if all(key in values for key in THERMAL) else "isothermal", "contact resistance": "true"}
     # Side reactions change a charge by microvolts and the life of a cell by years: they are there where the set knows them.
     options |= {name: kind for name, (kind, key) in SIDE_REACTIONS.items() if key in values}
     area = "Total heat transfer coefficient [W.m-2.K-1]"
@@ -297,7 +319,7 @@ SIDE_REACTIONS = {
     "SEI": ("solvent-diffusion limited", "SEI solvent diffusivity [m2.s-1]"),
     "lithium plating": ("partially reversible", "Exchange-current density for stripping [A.m-2]"),
 }
-THERMAL = "Negative current collector thickness [m]"
+THERMAL = ("Negative current collector thickness [m]", "Cell volume [m3]", "Cell cooling surface area [m2]")
 _ACTIVE = tuple(f"{side} electrode active material volume fraction" for side in ("Negative", "Positive"))
 
 
@@ -305,26 +327,27 @@ def _without(settings: Electrochemical) -> Electrochemical:
     return Electrochemical(**{**settings.__dict__, "resistance_scale": 1.0})
 
 
-def _is_file(parameters: str) -> bool:
-    return Path(parameters).suffix.lower() == ".json"
-
-
 def _parameters(settings: Electrochemical) -> Any:
     """A fresh set of parameter values. Raises SetUpError for an unknown name, and for a file that is missing or is none."""
     import pybamm
 
-    if _is_file(settings.parameters):
+    if settings.file:
         if not Path(settings.parameters).is_file():
             raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
         try:
-            return pybamm.ParameterValues.create_from_bpx(settings.parameters)
+            with warnings.catch_warnings():
+                # That the file's cut-off voltages stand for the OCV at SOC 0 and 1 where it has none of these, as docs/cells.md says.
+                warnings.filterwarnings("ignore", message=".*not found in BPX file", category=UserWarning)
+                return pybamm.ParameterValues.create_from_bpx(settings.parameters)
         except Exception as error:
             # Its parser raises what pydantic, json and pybamm raise.
             raise SetUpError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error
-    known = sorted(pybamm.parameter_sets.keys())
-    if settings.parameters not in known:
-        raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}, allowed are a BPX file and {', '.join(known)}")
-    return pybamm.ParameterValues(settings.parameters)
+    name = settings.parameters
+    why = f" ({OTHER_SETS[name]})" if name in OTHER_SETS else ""
+    # A set that PyBaMM got later may run too; its absence from the list is no reason to refuse it.
+    if why or name not in list(pybamm.parameter_sets):
+        raise SetUpError(f"electrochemical plant: parameters = {name!r}{why}, allowed are a BPX file (.json) and {', '.join(SETS)}")
+    return pybamm.ParameterValues(name)
 
 
 def _reader(built: Any) -> ca.Function:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -22,7 +23,7 @@ from chargetune.study.serialization import space_from_json
 from chargetune.study.store.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial
 
-__all__ = ["Exported", "Format", "bdf_columns", "export"]
+__all__ = ["Exported", "Format", "bdf_columns", "export", "planned_files"]
 
 Format = Literal["parquet", "csv"]
 # Signal of this library -> BDF's name and what is added for its unit.
@@ -77,8 +78,7 @@ def export(
     Raises ImportError without pandas (and pyarrow), StoreError for a study that is not there.
     """
     _need(form)
-    records = store.studies() if study is None else [store.study(study)]
-    work = [(record, [*store.earlier(record.id), *store.trials(record.id)]) for record in records]
+    records, work = _work(store, study)
     total, done = sum(len(trials) for _, trials in work), 0
     files: list[Path] = []
     left: list[str] = []
@@ -98,12 +98,31 @@ def export(
                 left.append(f"study {record.name!r}, trial {trial.number}: {error}")
             else:
                 if table is not None:
-                    name = f"trial-{trial.number:04d}.bdf" if trial.number >= 0 else f"earlier-{-trial.number:04d}.bdf"
-                    files.append(_write(table, place / name, form))
+                    files.append(_write(table, place / _trace_name(trial), form))
             done += 1
             if step is not None:
                 step(done, total)
     return Exported(tuple(files), tuple(left))
+
+
+def planned_files(store: Store, folder: str | os.PathLike[str], *, study: str | None = None, form: Format = "parquet") -> list[Path]:
+    """The files that `export` writes, but for those of traces that turn out to be damaged."""
+    records, work = _work(store, study)
+    files: list[Path] = []
+    for record, trials in work:
+        place = Path(folder) / _folder_name(record, records)
+        files += [place / "study.json", place / f"trials.{form}"]
+        files += [place / f"{_trace_name(trial)}.{form}" for trial in trials if trial.trace_sha256 is not None]
+    return files
+
+
+def _work(store: Store, study: str | None) -> tuple[list[StudyRecord], list[tuple[StudyRecord, list[Trial]]]]:
+    records = store.studies() if study is None else [store.study(study)]
+    return records, [(record, [*store.earlier(record.id), *store.trials(record.id)]) for record in records]
+
+
+def _trace_name(trial: Trial) -> str:
+    return f"trial-{trial.number:04d}.bdf" if trial.number >= 0 else f"earlier-{-trial.number:04d}.bdf"
 
 
 def _need(form: Format) -> None:
@@ -126,12 +145,12 @@ def _trace(store: Store, record: StudyRecord, trial: Trial) -> Any:
 
 
 def _write(frame: Any, path: Path, form: Format) -> Path:
-    path = path.with_name(f"{path.name}.{form}")
+    content = io.BytesIO()
     if form == "csv":
-        frame.to_csv(path, index=False)
+        frame.to_csv(content, index=False)
     else:
-        frame.to_parquet(path, index=False)
-    return path
+        frame.to_parquet(content, index=False)
+    return write_whole(path.with_name(f"{path.name}.{form}"), content.getvalue())
 
 
 def _column(name: str, unit: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

@@ -9,10 +9,11 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
-
+from chargetune.battery.studies.campaign_file import CampaignFile
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config, read_tables
+from chargetune.runtime.interrupts import raise_lost_interrupt
+from chargetune.study.names import check_name
 from chargetune.study.result import Reason, StudyResult, read_result
 from chargetune.study.store.store import Store, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
@@ -23,25 +24,6 @@ __all__ = ["Entry", "Standing", "load_campaign", "run_campaign", "standings"]
 TURN_S = 2.0
 # A plant that ends the process of its study does it that often before the study leaves the trial out; once more is something else.
 LOSSES_MAX = 3
-
-
-class CampaignTable(BaseModel):
-    """Study files, seeds, trials of each study; with ``mismatch_from_seed`` a seed also draws the controller's wrong model."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-    configs: list[str] = Field(min_length=1)
-    seeds: str | list[int] = Field(default="0:1")
-    trials: int | None = Field(default=None, ge=1)
-    mismatch_from_seed: bool = False
-
-
-class CampaignFile(BaseModel):
-    """The whole file."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-    campaign: CampaignTable
 
 
 @dataclass(frozen=True)
@@ -103,7 +85,7 @@ def load_campaign(path: str | Path) -> list[Entry]:
             raise ValueError(f"{path}: campaign.configs: there is no file {file}")
         config = load_config(file)
         for seed in seeds:
-            changes = {"name": f"{stem} seed {seed}", "seed": seed, "trials": table.trials or config.study.trials}
+            changes = {"name": check_name(f"{stem} seed {seed}"), "seed": seed, "trials": table.trials or config.study.trials}
             changed = config.model_copy(update={"study": config.study.model_copy(update=changes)})
             if table.mismatch_from_seed:
                 changed = changed.model_copy(update={"controller": replace(config.controller, mismatch_seed=seed)})
@@ -136,6 +118,7 @@ def run_campaign(
                 entry = queue.popleft()
                 turns[executor.submit(_turn, entry, store)] = entry
             finished, _ = wait(turns, return_when=FIRST_COMPLETED)
+            raise_lost_interrupt()
             for future in finished:
                 entry = turns.pop(future)
                 standing = _standing(future, entry, store, losses)

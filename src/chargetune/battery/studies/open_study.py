@@ -11,6 +11,7 @@ from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
+from chargetune.battery.studies.carry_over import ChargingCarry
 from chargetune.battery.studies.study_file import Config, TunerName, TwinTable
 from chargetune.study.evaluation import Evaluate
 from chargetune.study.store.store import Store
@@ -30,8 +31,8 @@ def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
 def _over_range(problem: ChargingProblem) -> RangeEvaluation:
     if problem.range is None:
         raise ValueError("tuner = 'range' is given without a table [range], which says what differs between the charges")
-    if problem.plant is not None:
-        raise ValueError("tuner = 'range' is given with [plant], allowed is the cell's own circuit, of which hundreds are drawn")
+    if problem.plant_cell is None:
+        raise ValueError("tuner = 'range' is given with an electrochemical [plant], allowed is a circuit, of which hundreds are drawn")
     from chargetune import learning
 
     return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws)
@@ -101,4 +102,5 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         batch=config.study.batch,
         earlier=config.earlier(folder),
         accept_changed=accept_changed,
+        carry=ChargingCarry(problem),
     )

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator
 
-from chargetune.battery.cell.cell import Cell, default_cell, load_cell
+from chargetune.battery.cell.cell import PACK, PACK_MAX, Cell, default_cell, load_cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.kalman import Kalman
@@ -29,8 +29,13 @@ from chargetune.battery.charging.settings import (
     SensorSettings,
 )
 from chargetune.battery.charging.tunables import Tunables
+from chargetune.battery.plants.circuit import Circuit
 from chargetune.battery.plants.electrochemical import Electrochemical
-from chargetune.study.warm_start import Earlier
+from chargetune.battery.studies.file_errors import plain_errors
+from chargetune.study.names import check_name
+
+if TYPE_CHECKING:
+    from chargetune.study.warm_start import Earlier
 
 __all__ = ["Config", "TunerName", "load_config", "problem_of_document", "read_tables"]
 
@@ -54,18 +59,46 @@ class EarlierTable(_Table):
 class StudyTable(_Table):
     """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time, earlier studies."""
 
-    name: str = Field(default="study", min_length=1, max_length=200)
+    name: str = "study"
     tuner: TunerName = "default"
     trials: int = Field(default=60, ge=1)
     seed: int = Field(default=0, ge=0)
     batch: int = Field(default=1, ge=1)
     earlier: list[EarlierTable] = Field(default_factory=list)
 
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str) -> str:
+        return check_name(name)
+
 
 class CellTable(_Table):
-    """The plant's cell; without a file the default cell."""
+    """The cell of controller and plant; without a file the default cell. A pack of it has the limits of one cell, in V and A per cell."""
 
-    file: str | None = None
+    file: str | None = Field(default=None, description="Cell file, relative to this file; without it the case study's cell.")
+    series: int | None = Field(
+        default=None, ge=1, le=PACK_MAX, description="Cells in series in a pack; every V and A in this file stays per cell. Default 1."
+    )
+    parallel: int | None = Field(
+        default=None, ge=1, le=PACK_MAX, description="Cells in parallel in a pack; every V and A in this file stays per cell. Default 1."
+    )
+
+
+class PlantCellTable(_Table):
+    """Another cell as plant: the controller keeps the one of [cell], whose limits hold."""
+
+    cell: str = Field(min_length=1, description="Cell file of the plant, relative to this file; the limits in it are not used.")
+
+
+def _kind_of_plant(table: object) -> str:
+    return CELL_PLANT if isinstance(table, PlantCellTable) or (isinstance(table, Mapping) and "cell" in table) else MODEL_PLANT
+
+
+# In the place of an error, where the kinds of a plant stand, they are left out.
+CELL_PLANT, MODEL_PLANT = "<another cell>", "<electrochemical model>"
+PlantTable = Annotated[
+    Annotated[Electrochemical, Tag(MODEL_PLANT)] | Annotated[PlantCellTable, Tag(CELL_PLANT)], Discriminator(_kind_of_plant)
+]
 
 
 class TwinTable(_Table):
@@ -86,7 +119,7 @@ class Config(_Table):
 
     study: StudyTable = StudyTable()
     cell: CellTable = CellTable()
-    plant: Electrochemical | None = None
+    plant: PlantTable | None = None
     controller: ControllerSettings = ControllerSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     limits: LimitSettings = LimitSettings()
@@ -98,14 +131,14 @@ class Config(_Table):
     twin: TwinTable | None = None
     range: ChargingRangeSettings | None = None
 
-    def problem(self, folder: Path | None = None, *, cell: Cell | None = None) -> ChargingProblem:
-        """The charging problem; a relative cell file is looked for in ``folder``, ``cell`` stands in for the file's.
+    def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant_cell: Cell | None = None) -> ChargingProblem:
+        """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant_cell`` stand in for the files'.
 
         Raises ValueError, FileNotFoundError.
         """
         return ChargingProblem(
             cell=cell or self._cell(folder),
-            plant=self.plant,
+            plant=Circuit(plant_cell) if plant_cell else self._plant(folder),
             controller=self.controller,
             estimator=self.estimator,
             limits=self.limits,
@@ -119,6 +152,9 @@ class Config(_Table):
 
     def earlier(self, folder: Path | None = None) -> list[Earlier]:
         """The earlier studies; a relative file is looked for in ``folder``."""
+        # Only here: it loads what reads a store.
+        from chargetune.study.warm_start import Earlier
+
         here = Path() if folder is None else folder
         return [Earlier(e.store if "://" in e.store else here / e.store, e.study) for e in self.study.earlier]
 
@@ -126,7 +162,12 @@ class Config(_Table):
         """What decides the trials, as JSON data for the store: the cell's numbers instead of its file, without the number of trials."""
         data = self.model_dump(mode="json")
         cell = self._cell(folder)
-        data["cell"] = json.loads(json.dumps(asdict(cell)))
+        data["cell"] = _cell_document(cell)
+        plant = self._plant(folder)
+        if isinstance(plant, Circuit):
+            data["plant"] = {"cell": _cell_document(plant.cell)}
+        elif plant is not None:
+            data["plant"] = asdict(plant)
         data["theta"].pop("values")
         data["study"] = {"tuner": self.study.tuner}
         # What is not given leaves no entry, that studies of before it resume.
@@ -139,16 +180,46 @@ class Config(_Table):
         if isinstance(settings, (OffsetFree, Adaptive)):
             # Defaults may change; what decides the trials does not.
             data["estimator"][str(self.estimator.kind)] = asdict(settings)
-        for table, name in (("controller", "current_ramp_A_s"), ("theta", "observer"), *(("estimator", name) for name in FILTERS)):
+        absent = (("controller", "current_ramp_A_s"), ("theta", "observer"), ("theta", "current_ramp"))
+        for table, name in (*absent, *(("estimator", name) for name in FILTERS)):
             if not data[table][name]:
                 del data[table][name]
         return data | _as_recorded(data)
 
     def _cell(self, folder: Path | None) -> Cell:
-        if self.cell.file is None:
-            return default_cell()
-        return load_cell(Path(self.cell.file) if folder is None else folder / self.cell.file)
+        table = self.cell
+        cell = default_cell() if table.file is None else load_cell(_beside(folder, table.file))
+        return replace(cell, series=table.series or cell.series, parallel=table.parallel or cell.parallel)
 
+    def _plant(self, folder: Path | None) -> Circuit | Electrochemical | None:
+        plant = self.plant
+        if isinstance(plant, PlantCellTable):
+            return Circuit(load_cell(_beside(folder, plant.cell)))
+        if plant is not None and plant.file:
+            # A worker, and a later command on the store, may begin in another folder.
+            return replace(plant, parameters=str(_beside(folder, plant.file).absolute()))
+        return plant
+
+
+def _beside(folder: Path | None, file: str) -> Path:
+    return Path(file) if folder is None else folder / file
+
+
+def _cell_document(cell: Cell) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads(json.dumps(asdict(cell)))
+    for name in PACK:
+        # A single cell leaves no entry, that studies of before there were packs resume.
+        if data[name] == 1:
+            del data[name]
+    return data
+
+
+# A key at the top that only another kind of file has, the model of that kind, and what to do with it.
+OTHER_FILES = {
+    "campaign": ("CampaignFile", "a campaign file, which `chargetune campaign` takes"),
+    "capacity_Ah": ("", "a cell file; a study names it in its table [cell], file = ..."),
+    "study": ("Config", "a study file, which `chargetune tune` takes; a campaign names it in [campaign], configs = [...]"),
+}
 
 # What older files and stores call the kind of the estimator.
 OVERPOTENTIAL = {"model": "open_loop", "exact": "exact"}
@@ -185,11 +256,18 @@ def _migrated(data: dict[str, Any]) -> dict[str, Any]:
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
-    cell = _tuples(document["cell"])
+    tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
+    plant = tables.get("plant")
+    other = _cell_of_document(tables.pop("plant")["cell"]) if isinstance(plant, Mapping) and "cell" in plant else None
+    config = Config.model_validate_json(json.dumps(_migrated(tables)))
+    return config.problem(cell=_cell_of_document(document["cell"]), plant_cell=other)
+
+
+def _cell_of_document(data: Mapping[str, Any]) -> Cell:
+    cell = _tuples(data)
     for name, make in (("thermal", Thermal), ("anode", Anode)):
         cell[name] = make(**_tuples(cell[name])) if cell.get(name) else None
-    tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
-    return Config.model_validate_json(json.dumps(_migrated(tables))).problem(cell=Cell(**cell))
+    return Cell(**cell)
 
 
 def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -216,15 +294,6 @@ def read_tables(path: str | Path, model: type[T]) -> T:
         # A dataclass is made from a table of JSON, but in strict mode not from a dict. JSON has no dates, and no key here is one.
         return model.model_validate_json(json.dumps(data, default=lambda date: {"date": str(date)}))
     except ValidationError as error:
-        raise ValueError("\n".join(f"{path}: {_plain(problem)}" for problem in error.errors())) from None
-
-
-def _plain(problem: Any) -> str:
-    field = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{field} is not a known key"
-    if problem["type"] == "value_error":
-        # What a table says of its own entries names field, value and what is allowed.
-        return f"{field}: {problem['ctx']['error']}"
-    message = problem["msg"]
-    return f"{field} = {problem['input']!r}: {message[0].lower()}{message[1:]}"
+        lines = [f"{path}: {line}" for line in plain_errors(error.errors(), model)]
+        other = next((said for key, (kind, said) in OTHER_FILES.items() if key in data and model.__name__ != kind), None)
+        raise ValueError("\n".join([f"{path}: {other}"] if other else lines)) from None

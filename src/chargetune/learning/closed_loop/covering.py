@@ -52,7 +52,7 @@ def predicted_rows(controller: Controller, episode: Episode, theta: NDArray[np.f
         # Before the first input only a state is known: it is the same on both sides of the jump of the input, an output is not.
         if name in controller.model.state_names:
             received[0, i] = start[0]
-    last = np.vstack([np.zeros_like(episode.input[:1]), episode.input[:-1]])
+    last = np.vstack([controller.input_before, episode.input[:-1]])
     d, count = len(theta), len(episode)
     roll = cached(f"rolled rows {controller.structure} {count}", lambda: step.mapaccum("rolled", count, 2))
     (q,) = numpy_call(of_fixed, theta, controller.model.nominal)

@@ -26,7 +26,8 @@ class IterativeLearning:
     limit. It is smoothed (Savitzky-Golay filter, order 2, ``window`` samples), then added to the prediction: in full where it asks for
     more caution, by the share ``relax`` where it allows less. The first theta is ``start``, or theta_0.
     It is fast and promises nothing: it knows only what the last trial went through.
-    Raises ValueError for relax outside (0, 1] or window below 3. Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
+    Raises ValueError for relax outside (0, 1], window below 3, and a controller with given signals.
+    Source: Bristow et al., IEEE Control Syst. Mag. 26 (2006) 96.
     """
 
     loop: ClosedLoop
@@ -39,6 +40,9 @@ class IterativeLearning:
             raise ValueError(f"iterative learning: relax = {self.relax!r}, allowed is (0, 1]")
         if isinstance(self.window, bool) or not isinstance(self.window, int) or self.window < 3:
             raise ValueError(f"iterative learning: window = {self.window!r}, allowed is an integer >= 3")
+        told = ", ".join(self.loop.controller.given_names)
+        if told:
+            raise ValueError(f"iterative learning: the controller's given = {told}, allowed is none: episodes do not hold given signals")
 
     def ask(self, space: ParameterSpace, trials: Sequence[TrialLike], n: int = 1) -> NDArray[np.float64]:
         """The next theta, repeated ``n`` times, because each step needs the trial before it; shape (n, d)."""

@@ -15,6 +15,7 @@ from chargetune.episode.compiled import CompiledEpisode, compiled_episode
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.episode.score_limits import ScoredLimit, limit_samples, score_limits
+from chargetune.model.given import Given, checked_given
 from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
 
 __all__ = ["RangeLoop", "SimulatedRange"]
@@ -50,6 +51,8 @@ class SimulatedRange:
     """The `RangeLoop` of a controller and a simulated plant with `Variation`s.
 
     The estimator reads what the drawn sensors measure; the limits are judged by the true outputs, `ScoredLimit` by `ScoredLimit`.
+    ``given``: the given signals of controller and plant, one set for all draws or several cases (days, forecasts), of which each draw
+    has the one that its seed draws.
     """
 
     controller: Controller
@@ -58,12 +61,26 @@ class SimulatedRange:
     limits: tuple[ScoredLimit, ...]
     objective: Callable[[Episode], float]
     largest_of: tuple[str, ...] = ()
+    given: Given | Sequence[Given] | None = None
+
+    def __post_init__(self) -> None:
+        names = tuple(dict.fromkeys((*self.controller.given_names, *self.range_of_use.plant.given)))
+        if not self._cases:
+            raise ValueError("range: given has no case, allowed is one set of signals or several")
+        for case in self._cases:
+            checked_given(names, case, self.steps, self.controller.horizon)
+
+    @property
+    def _cases(self) -> list[Given]:
+        return [self.given or {}] if self.given is None or isinstance(self.given, Mapping) else list(self.given)
 
     def draw(self, count: int, seed: int) -> list[DrawnPlant]:
         return self.range_of_use.draw(count, seed)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
-        episodes = self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
+        cases = self._cases
+        told = [cases[one.seed % len(cases)] for one in plants]
+        episodes = self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants], given=told)
         return [e.noise_free() if e.ending is Ending.DONE else None for e in episodes]
 
     def score(self, episode: Episode, *, metrics: bool = True) -> Score | None:

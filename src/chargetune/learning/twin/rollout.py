@@ -63,9 +63,13 @@ def _roll(
     twin: Twin, which: int, m: NDArray[np.float64], inputs: Sequence[NDArray[np.float64]], shape: tuple[int, ...]
 ) -> list[NDArray[np.float64]]:
     """What the function of that number says of each interval, in this shape, after the first axes of m."""
-    padded = np.zeros((len(inputs), _padded(max(len(u) for u in inputs)), len(twin.model.inputs)))
+    nu, length = len(twin.model.inputs), _padded(max(len(u) for u in inputs))
+    padded = np.zeros((len(inputs), length, nu + len(twin.given)))
     for row, u in zip(padded, inputs, strict=True):
-        row[: len(u)] = u
+        row[: len(u), :nu] = u
+    # What follows a given signal comes in with the inputs.
+    for i, values in enumerate(twin.given.values()):
+        padded[:, :, nu + i] = np.asarray(values)[np.minimum(np.arange(length), len(values) - 1)]
     function = partial(_evaluated, _Key(twin), which, padded)
     several, d = m.shape[:-1], m.shape[-1]
     rows = m.reshape(-1, d)
@@ -82,7 +86,7 @@ class _Key:
         model = twin.model
         # The functions live as long as this key, so no others have their hashes meanwhile.
         names = (model.state_names, model.output_names, tuple(model.parameter_blocks.items()))
-        self._content = (model.f.__hash__(), model.h.__hash__(), *names, twin.unknowns, tuple(twin.noise_sd))
+        self._content = (model.f.__hash__(), model.h.__hash__(), *names, twin.unknowns, tuple(twin.noise_sd), tuple(twin.given))
 
     def __hash__(self) -> int:
         return hash(self._content)
@@ -152,15 +156,19 @@ def _simulated(key: _Key, count: int) -> tuple[ca.Function, ca.Function]:
     """
     twin = key.twin
     model = twin.model
-    nx, nu, d = len(model.states), len(model.inputs), sum(twin.sizes)
+    nx, nu, d = len(model.states), len(model.inputs) + len(twin.given), sum(twin.sizes)
     m, nominal, begin, p, x0, bias = _symbols(twin)
     x, u, sensitivity = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("S", nx, d)
+    own, told = split(u, (len(model.inputs), len(twin.given)))
+    places = dict(zip(model.parameter_blocks, np.cumsum([0, *model.parameter_blocks.values()]), strict=False))
+    for i, name in enumerate(twin.given):
+        p[int(places[name])] = told[i]
     rows = [model.output_names.index(name) for name in twin.noise_sd]
 
     def outputs(state: Any) -> Any:
-        return model.h(state, u, p)[rows] + bias
+        return model.h(state, own, p)[rows] + bias
 
-    after, at = model.f(x, u, p), ca.SX.sym("after", nx)
+    after, at = model.f(x, own, p), ca.SX.sym("after", nx)
     ahead = ca.mtimes(ca.jacobian(after, x), sensitivity) + ca.jacobian(after, m)
     start, end = outputs(x), outputs(at)
     slope_start = ca.mtimes(ca.jacobian(start, x), sensitivity) + ca.jacobian(start, m)

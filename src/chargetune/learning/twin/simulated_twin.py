@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from chargetune.control.controller import Controller
 from chargetune.episode.compiled import CompiledEpisode, compiled_episode
@@ -20,6 +20,7 @@ from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.rollout import parameters, start_state
 from chargetune.learning.twin.twin import Twin, Uncertain
 from chargetune.learning.twin.twin_loop import Member
+from chargetune.model.given import Given, actual, checked_given
 from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
 
@@ -35,19 +36,26 @@ DISCREPANCY_SHARE = 0.01
 class TwinSimulator:
     """Episodes of ``steps`` intervals of ``controller`` on members of ``twin``, without noise, as one compiled function.
 
-    ``features``: outputs or inputs, one to three, with their ranges, that the discrepancy is a table over.
+    ``features``: outputs or inputs, one to three, with their ranges, that the discrepancy is a table over. ``given``: what the controller
+    is told, the same in each of them; the plant follows ``twin.given``.
     """
 
     controller: Controller
     twin: Twin
     features: Mapping[str, tuple[float, float]]
     steps: int
+    given: Given | None = None
 
     def __post_init__(self) -> None:
-        plant, model = SimulatedPlant(self.twin.model, self.twin.start), self.twin.model
-        if self.controller.given:
-            told = ", ".join(self.controller.given_names)
-            raise ValueError(f"twin: the controller's given = {told}, allowed is a controller without given signals")
+        model = self.twin.model
+        plant = SimulatedPlant(model, self.twin.start, given=tuple(self.twin.given))
+        names = tuple(dict.fromkeys((*self.controller.given_names, *self.twin.given)))
+        told = checked_given(names, self._told, self.steps, self.controller.horizon)
+        for name, values in self.twin.given.items():
+            if not np.array_equal(actual([told[name]], self.steps).ravel(), np.asarray(values)[: self.steps]):
+                raise ValueError(
+                    f"twin: given of {name} is not what the plant follows, allowed is one sequence, or forecasts that begin with it"
+                )
         check_run(plant, self.steps, 0, ())
         signal_indices(self.controller, plant)
         names = (*model.output_names, *model.input_names)
@@ -65,7 +73,7 @@ class TwinSimulator:
         """
         plants = [self.plant(unknowns) for _, unknowns, _ in members]
         tables = [self._table(unknowns, discrepancy) for _, unknowns, discrepancy in members]
-        episodes = self._loop.run_each([theta for theta, _, _ in members], plants, tables=tables)
+        episodes = self._loop.run_each([theta for theta, _, _ in members], plants, tables=tables, given=self._told)
         return [episode if episode.ending is Ending.DONE else None for episode in episodes]
 
     def plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
@@ -79,8 +87,13 @@ class TwinSimulator:
             sizes = model.parameter_blocks
             values = np.split(parameters(self.twin, unknowns), np.cumsum(list(sizes.values()))[:-1])
             start = dict(zip(model.state_names, (float(v) for v in start_state(self.twin, unknowns)), strict=True))
-            self._plants[key] = SimulatedPlant(model.with_parameters(**dict(zip(sizes, values, strict=True))), start)
+            own = model.with_parameters(**dict(zip(sizes, values, strict=True)))
+            self._plants[key] = SimulatedPlant(own, start, given=tuple(self.twin.given))
         return self._plants[key]
+
+    @property
+    def _told(self) -> dict[str, ArrayLike]:
+        return dict(self.twin.given) | dict(self.given or {})
 
     @cached_property
     def _plants(self) -> dict[bytes, SimulatedPlant]:
@@ -88,7 +101,7 @@ class TwinSimulator:
 
     @cached_property
     def _loop(self) -> CompiledEpisode:
-        plant = SimulatedPlant(self.twin.model, self.twin.start)
+        plant = SimulatedPlant(self.twin.model, self.twin.start, given=tuple(self.twin.given))
         return compiled_episode(self.controller, plant, self.steps, lookup_table=self._lookup_table)
 
     @cached_property
@@ -106,7 +119,8 @@ class SimulatedTwin:
     """The `TwinLoop` of a controller, a model of its plant and limits: all that `TwinTuner` needs to learn on a system of one's own.
 
     The verdict is that of `score_limits` with ``limits``, ``objective`` and ``windows``; only the objective is learnt from, so a
-    penalty plays no part. Make one with `build`, or with a `Twin` where its numbers are known.
+    penalty plays no part. Make one with `build`, or with a `Twin` where its numbers are known. ``given``: what the controller is told in
+    every trial (prices, references, forecasts), as for `simulate`.
     """
 
     controller: Controller
@@ -116,13 +130,14 @@ class SimulatedTwin:
     limits: tuple[ScoredLimit, ...]
     objective: Callable[[Episode], float]
     windows: Windows | None = None
+    given: Given | None = None
 
     def __post_init__(self) -> None:
         outputs = self.twin.model.output_names
         for signal in (*(limit.signal for limit in self.limits), *([self.windows.signal] if self.windows else [])):
             if signal not in outputs:
                 raise ValueError(f"twin: a limit or the windows of {signal!r}, allowed are {', '.join(outputs)}")
-        TwinSimulator(self.controller, self.twin, self.features, self.steps)
+        TwinSimulator(self.controller, self.twin, self.features, self.steps, self.given)
 
     @classmethod
     def build(
@@ -139,6 +154,8 @@ class SimulatedTwin:
         windows: Windows | None = None,
         start: Mapping[str, float] | None = None,
         discrepancy_sd_floor: Mapping[str, float] | None = None,
+        given: Given | None = None,
+        plant_given: Sequence[str] = (),
     ) -> SimulatedTwin:
         """Make one from a ``plant`` model with its nominal numbers.
 
@@ -154,6 +171,8 @@ class SimulatedTwin:
             its noise; else 3 sd of its noise. A rule of thumb to begin with: the scale of the discrepancy is learnt from how well each
             trial was predicted, from a tenth to ten times of what is stated. State less where the model is the plant but for its
             unknowns, more where physics was left out; with too much, safe mode finds no theta safe, with too little it is too sure.
+        given, plant_given
+            Given signals of every trial, and the scalar parameters of ``plant`` that follow those of their name, as in `SimulatedPlant`.
 
         Raises ValueError for what the model does not have, and where there is no range for a feature.
         """
@@ -161,16 +180,18 @@ class SimulatedTwin:
         widths = {name: high - low for name, (low, high) in (_two_sided(limits) | ranges).items()}
         stated = {n: max(sd, DISCREPANCY_SHARE * widths[n]) if n in widths else 3.0 * sd for n, sd in noise_sd.items()}
         floor = stated | dict(discrepancy_sd_floor or {})
+        told = checked_given(tuple(dict.fromkeys((*controller.given_names, *plant_given))), given, steps, controller.horizon)
+        followed = {name: actual([told[name]], steps).ravel().tolist() for name in plant_given}
         # What is missing in the dynamics goes on when the input is back at 0.
-        twin = Twin(plant, tuple(unknowns), dict(noise_sd), dict(start or {}), floor, floor_at_zero_input=1.0)
-        return cls(controller, twin, ranges, steps, tuple(limits), objective, windows)
+        twin = Twin(plant, tuple(unknowns), dict(noise_sd), dict(start or {}), floor, floor_at_zero_input=1.0, given=followed)
+        return cls(controller, twin, ranges, steps, tuple(limits), objective, windows, given)
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
         return self._simulator.simulate(members)
 
     @cached_property
     def _simulator(self) -> TwinSimulator:
-        return TwinSimulator(self.controller, self.twin, self.features, self.steps)
+        return TwinSimulator(self.controller, self.twin, self.features, self.steps, self.given)
 
     def score(self, episode: Episode) -> Score | None:
         return score_limits(episode, self.limits, objective=self.objective, windows=self.windows).score

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -52,7 +52,9 @@ class Twin:
     """A `Model` of the plant, what of it is unknown, and which outputs are measured with what noise.
 
     ``noise_sd`` maps the measured outputs to the standard deviation of one sample, ``start`` the states at the start of every
-    trial to their nominal value (others are 0). ``discrepancy_sd_floor`` is by how much at least an output may be off at the largest input
+    trial to their nominal value (others are 0). ``given`` maps scalar parameters of the model that follow a given signal to its value in
+    each interval of every trial; beyond the end the last one holds.
+    ``discrepancy_sd_floor`` is by how much at least an output may be off at the largest input
     where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input, down to the
     share ``floor_at_zero_input`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does.
     Raises ValueError for what the model does not have.
@@ -64,6 +66,7 @@ class Twin:
     start: Mapping[str, float] = field(default_factory=dict)
     discrepancy_sd_floor: Mapping[str, float] = field(default_factory=dict)
     floor_at_zero_input: float = 0.0
+    given: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         model = self.model
@@ -85,6 +88,13 @@ class Twin:
             unknown = sorted(set(given) - set(allowed))
             if unknown:
                 raise ValueError(f"twin: {label} names {unknown}, allowed are {', '.join(allowed)}")
+        free = [name for name, size in model.parameter_blocks.items() if size == 1 and (name, "block") not in names]
+        unknown = sorted(set(self.given) - set(free))
+        if unknown:
+            raise ValueError(f"twin: given = {unknown}, allowed are scalar parameters that are known: {', '.join(free) or '(none)'}")
+        for name, values in self.given.items():
+            if not len(values) or not np.all(np.isfinite(values)):
+                raise ValueError(f"twin: given of {name} = {list(values)}, allowed are finite numbers, one for each interval")
         if not self.noise_sd or not all(math.isfinite(v) and v > 0 for v in self.noise_sd.values()):
             raise ValueError(f"twin: noise_sd = {dict(self.noise_sd)}, allowed are finite numbers > 0 for at least one output")
 
@@ -99,7 +109,9 @@ class Twin:
         model = self.model
         functions = [hashlib.blake2b(f.serialize().encode(), digest_size=16).hexdigest() for f in (model.f, model.h)]
         measured, floor = dict(self.noise_sd), dict(self.discrepancy_sd_floor)
-        return (*functions, model.nominal.tolist(), self.unknowns, measured, dict(self.start), floor, self.floor_at_zero_input)
+        told = {name: list(values) for name, values in self.given.items()}
+        own = (*functions, model.nominal.tolist(), self.unknowns, measured, dict(self.start), floor, self.floor_at_zero_input)
+        return (*own, told) if told else own
 
     @property
     def scalars(self) -> list[int]:

@@ -81,5 +81,5 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
             handles, labels = [*handles, limit_line], [*labels, "limit"]
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.1)
         figure.align_ylabels()
-        cell_note(figure, problem.cell.name, problem.cell.remark)
+        cell_note(figure, problem.cell.title, problem.cell.remark)
     return figure

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,23 +17,30 @@ from chargetune.report.study_view import StudyView, read_study
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["figures_of", "save_figures"]
+__all__ = ["figure_names", "figures_of", "save_figures"]
+
+
+def _drawings(view: StudyView) -> dict[str, Callable[[StudyView], Figure]]:
+    drawings: dict[str, Callable[[StudyView], Figure]] = {}
+    if view.problem is not None:
+        if any(t.trace_sha256 is not None for t in view.trials):
+            drawings["trajectories"] = trajectories_figure
+        if view.problem.theta.backoff is not None:
+            drawings["backoff"] = backoff_figure
+        if view.problem.theta.current_limit is not None:
+            drawings["current_limit"] = current_limit_figure
+        drawings |= {of: partial(resistance_figure, of=of) for of in view.problem.theta.ratios}
+    return {**drawings, "convergence": convergence_figure}
+
+
+def figure_names(view: StudyView) -> list[str]:
+    """Names of what can be drawn of a study, before anything is drawn."""
+    return list(_drawings(view))
 
 
 def figures_of(view: StudyView) -> dict[str, Figure]:
     """What can be drawn of a study: convergence always; of a charging study the trajectories, and what theta consists of."""
-    figures: dict[str, Figure] = {}
-    if view.problem is not None:
-        if any(t.trace_sha256 is not None for t in view.trials):
-            figures["trajectories"] = trajectories_figure(view)
-        if view.problem.theta.backoff is not None:
-            figures["backoff"] = backoff_figure(view)
-        if view.problem.theta.current_limit is not None:
-            figures["current_limit"] = current_limit_figure(view)
-        for of in view.problem.theta.ratios:
-            figures[of] = resistance_figure(view, of)
-    figures["convergence"] = convergence_figure(view)
-    return figures
+    return {name: draw(view) for name, draw in _drawings(view).items()}
 
 
 def save_figures(

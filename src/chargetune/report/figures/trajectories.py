@@ -113,7 +113,7 @@ def trajectories_figure(view: StudyView) -> Figure:
         _frame(figure, panels, problem, shown or [c["voltage_V"][1] for c in grey])
         letter(axes[: len(names)])
         legend_above(figure, handles)
-        cell_note(figure, problem.cell.name, view.remark)
+        cell_note(figure, problem.cell.title, view.remark)
     return figure
 
 

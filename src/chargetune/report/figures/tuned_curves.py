@@ -46,9 +46,9 @@ def backoff_values(backoff: Backoff, nodes_V: ArrayLike, soc: ArrayLike = SOC) -
     return np.asarray(CubicSpline(backoff.grid, np.asarray(nodes_V, dtype=float), bc_type="natural")(soc))
 
 
-def resistance_values(problem: ChargingProblem, nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
-    """R(z) in ohm of the circuit model with these node values: natural cubic spline, constant beyond the nodes, kept positive."""
-    values, own = np.asarray(nodes_ohm, dtype=float), problem.cell.soc
+def resistance_values(own: tuple[float, ...], nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
+    """R(z) in ohm of a circuit with these values at the SOC nodes ``own``: natural cubic spline, constant beyond, kept positive."""
+    values = np.asarray(nodes_ohm, dtype=float)
     nodes = table_nodes(own)
     spline = CubicSpline(nodes, np.interp(nodes, own, values), bc_type="natural")(soc)
     return np.asarray((spline + np.hypot(spline, FLOOR * values.mean())) / 2)
@@ -110,18 +110,21 @@ def resistance_figure(view: StudyView, of: str) -> Figure:
         raise ValueError(f"study {view.name!r} does not tune {of}")
     part = view.space.slices[ratio.name(of)]
     believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
-    true = np.array(getattr(problem.cell, f"{of}_ohm"))
     with journal_style():
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
-        handles = _grey(axis, [1e3 * resistance_values(problem, believed * t.theta[part]) for t in view.others])
-        nodes = {"plant": true, **{label: believed * theta[part] for label, theta in _thetas(view).items()}}
+        handles = _grey(axis, [1e3 * resistance_values(problem.cell.soc, believed * t.theta[part]) for t in view.others])
+        nodes = {label: (problem.cell.soc, believed * theta[part]) for label, theta in _thetas(view).items()}
+        plant = problem.plant_cell
+        if plant is not None and len(true := getattr(plant, f"{of}_ohm")):
+            nodes["plant"] = plant.soc, np.array(true)
         for label, color, marker in (("plant", GREEN, "s"), (START, BLUE, "o"), ("tuned", ORANGE, "o")):
             if label in nodes:
-                own = {"tuned": view.tuned_label, START: view.start_label}.get(label, label)
-                text, dashes = own, view.tuned_dashes if label == "tuned" else "-"
-                values = 1e3 * resistance_values(problem, nodes[label])
+                text = {"tuned": view.tuned_label, START: view.start_label}.get(label, label)
+                dashes = view.tuned_dashes if label == "tuned" else "-"
+                own, ohms = nodes[label]
+                values = 1e3 * resistance_values(own, ohms)
                 handles += axis.plot(100 * SOC, values, color=color, linestyle=dashes, label=text, zorder=3)
-                axis.plot(100 * np.array(problem.cell.soc), 1e3 * nodes[label], marker, color=color, markersize=3.5, zorder=4)
+                axis.plot(100 * np.array(own), 1e3 * ohms, marker, color=color, markersize=3.5, zorder=4)
         axis.set_ylim(bottom=0.0)
         axis.set_ylabel(f"${of[0]}_{of[1]}$ (mΩ)")
         _finish(figure, axis, view, problem.cell, handles)

@@ -40,12 +40,12 @@ def report_page(
     """The page as HTML.
 
     ``evaluate`` runs the best theta again, its neighbours, and theta with each entry put back, on the simulated plant; ``progress`` is
-    called after each of these `evaluations`. It is done only where the plant is the cell's own circuit, which takes milliseconds an
+    called after each of these `evaluations`. It is done only where the plant is a circuit, which takes milliseconds an
     episode. With it a safe study's twin is asked again what it promised. ``others`` are further studies of the store to compare with,
     ``certified`` is the study's certificate (`certificate_of`).
     """
     best, start = view.tuned, view.start
-    quick = evaluate and view.problem is not None and view.problem.plant is None and best is not None
+    quick = evaluate and view.problem is not None and view.problem.plant_cell is not None and best is not None
     # On a thousand drawn plants an evaluation takes seconds: there each entry is put back, and not moved to its neighbours.
     moved = finite_differences(view, best, progress) if quick and best is not None and not view.over_range else []
     put_back = importance(view, best, progress) if quick and best is not None else []

@@ -85,12 +85,13 @@ def profiles(view: StudyView, theta: NDArray[np.float64]) -> list[dict[str, Any]
         out.append(_profile("current_limit", "current limit (A)", soc, curve, 100 * grid, largest * nodes))
     for of, ratio in problem.theta.ratios.items():
         believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
-        true = np.array(getattr(problem.cell, f"{of}_ohm"))
         nodes = 1e3 * believed * theta[slices[ratio.name(of)]]
-        curve = 1e3 * resistance_values(problem, nodes / 1e3)[::2]
+        curve = 1e3 * resistance_values(problem.cell.soc, nodes / 1e3)[::2]
         entry = _profile(of, f"{of} (mΩ)", soc, curve, 100 * np.array(problem.cell.soc), nodes)
-        beside = {"label": "plant", "x": rounded(soc), "y": rounded(1e3 * resistance_values(problem, true)[::2])}
-        out.append(entry | ({"beside": beside} if problem.plant is None else {}))
+        plant = problem.plant_cell
+        if plant is not None and len(true := getattr(plant, f"{of}_ohm")):
+            entry |= {"beside": {"label": "plant", "x": rounded(soc), "y": rounded(1e3 * resistance_values(plant.soc, true)[::2])}}
+        out.append(entry)
     return out
 
 

@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
-from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.charging.wording import metric_words
-from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
 from chargetune.report.page.html import Cell, beside, paragraph, section, table
@@ -30,10 +28,11 @@ def opening(view: StudyView) -> str:
     failed = sum(t.status is TrialStatus.FAILED for t in view.trials)
     running = sum(t.status is TrialStatus.RUNNING for t in view.trials)
     counts = f"{len(view.trials)} trials: {len(done) - broke} within the limits, {broke} beyond one, {failed} failed"
-    more = f", {running} not told yet" if running else ""
+    apart = sum(t.status is TrialStatus.APART for t in view.trials)
+    more = (f", {apart} set apart" if apart else "") + (f", {running} not told yet" if running else "")
     best = view.tuned
     if best is None:
-        verdict = paragraph("No trial has a score: there is no result.", "bad")
+        verdict = paragraph(f"There is no result: {view.result.sentence}.", "bad")
     elif not best.feasible:
         verdict = paragraph(f"The result, trial {best.number}, did not keep the limits{over}: {view.result.sentence}.", "bad")
     else:
@@ -77,16 +76,15 @@ def what_was_tuned(view: StudyView) -> str:
     problem, head = view.problem, study_head(view)
     parts = []
     if problem is not None:
-        plant = plant_line(problem)
         control, charge = problem.controller, problem.episode
         seed = control.mismatch_seed
         own = "the plant's own" if problem.plant is None else "those of the cell file's circuit, which is another model than the plant"
         belief = own if seed is None else f"those of the cell file, wrong by the factors of mismatch seed {seed}"
         start = "of the range of use" if view.over_range and problem.range and problem.range.soc_start else f"{charge.soc_start:g}"
         facts = [
-            ("cell", problem.cell.name),
+            ("cell", problem.cell.title),
             ("capacity", f"{problem.cell.capacity_Ah:g} Ah"),
-            ("plant", plant),
+            ("plant", problem.plant_line),
             ("controller's parameters", belief),
             ("estimator", problem.estimator.line),
             ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
@@ -96,11 +94,13 @@ def what_was_tuned(view: StudyView) -> str:
             ),
             ("tuner", view.tuner),
         ]
+        if problem.cell.pack_line:
+            facts.insert(1, ("pack", problem.cell.pack_line))
         if problem.range is not None:
             facts.insert(-1, ("range of use", problem.range.line))
         parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts], kind="facts"))
         if view.remark:
-            parts.append(paragraph(f"{problem.cell.name}: {view.remark}", "faint"))
+            parts.append(paragraph(f"{problem.cell.title}: {view.remark}", "faint"))
         rows = [(x["name"], f"{x['bound']:g} {x['unit']}", _amount(x["name"], x["tolerance"]), x["kind"]) for x in head["limits"]]
         parts.append(table(("limit", "bound", "tolerance", "in the controller"), rows))
     else:
@@ -110,21 +110,6 @@ def what_was_tuned(view: StudyView) -> str:
         allowed = [(x["label"], _told(x["tolerance"], x["unit"])) for x in head["excesses"]]
         parts += [table(("limit", "tolerance"), allowed)] if allowed else []
     return section("What was tuned", *parts)
-
-
-def plant_line(problem: ChargingProblem) -> str:
-    """The plant of a charge for people."""
-    plant = problem.plant
-    if plant is None:
-        return "the cell's own circuit, simulated"
-    if not isinstance(plant, Electrochemical):
-        return type(plant).__name__
-    changed = [(plant.capacity_scale, "capacity"), (plant.resistance_scale, "resistance")]
-    further = "".join(f", {name} times {factor:g}" for factor, name in changed if factor != 1.0)
-    return (
-        f"PyBaMM's {plant.model} with parameters {plant.parameters}, surroundings {plant.ambient_K:g} K, "
-        f"cooling {plant.cooling_W_m2K:g} W/m2K, {plant.mesh} mesh{further}"
-    )
 
 
 def _amount(name: str, value: float, digits: str = ".3g") -> str:

@@ -37,7 +37,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "name": view.name,
         "created_at": "" if record is None else record.created_at,
         "tuner": view.tuner,
-        "cell": "" if problem is None else problem.cell.name,
+        "cell": "" if problem is None else problem.cell.title,
         "remark": view.remark,
         "objective": {
             "label": words.axis,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 import time
@@ -185,6 +186,7 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
         # WAL needs companion files; where they cannot be made and are not there, nobody is writing either.
         query = "immutable=1"
     uri = f"{path.as_uri()}?{query}"
+    tidy = query == "mode=ro" and not any(path.with_name(path.name + end).exists() for end in ("-wal", "-shm", "-journal"))
 
     def connect() -> sqlite3.Connection:
         # With isolation_level None the transactions are those that `begin` below opens, none is opened behind its back.
@@ -200,6 +202,12 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
         connection.execute("PRAGMA foreign_keys=ON")
         connection.execute("PRAGMA synchronous=FULL")
 
+    if tidy:
+
+        @event.listens_for(engine, "engine_disposed")
+        def remove_companions(_: Engine) -> None:
+            _close_as_writer(path)
+
     @event.listens_for(engine, "begin")
     def begin(connection: Connection) -> None:
         options = connection.get_execution_options()
@@ -207,6 +215,12 @@ def connect_engine(path: Path, *, read_only: bool, busy_timeout_s: float, mode: 
             connection.exec_driver_sql("BEGIN IMMEDIATE" if options.get("writing") else "BEGIN")
 
     return engine
+
+
+def _close_as_writer(path: Path) -> None:
+    """Remove the companion files that reading has made: SQLite does so, under its locks, when the last one that may write closes."""
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=rw", uri=True, timeout=0.0)) as last:
+        last.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def explain(path: Path, error: DBAPIError) -> str:

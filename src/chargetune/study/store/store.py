@@ -147,11 +147,21 @@ class Store:
         self.write(add)
         return self.study(name)
 
-    def change_study(self, study_id: int, identity: Mapping[str, Any], *, term: int | None = None) -> None:
-        """Replace what a study is about; the trials so far keep the hash of the old one in their provenance."""
+    def change_study(self, study_id: int, identity: Mapping[str, Any], trials: Sequence[Trial] = (), *, term: int | None = None) -> None:
+        """Replace what a study is about, and those of its ``trials`` that are others by that, in one transaction.
+
+        The trials so far keep the hash of the old identity in their provenance.
+        """
         text = canonical_json(identity, "study")
         query = update(schema.study).where(schema.study.c.id == study_id).values(identity=text, identity_sha256=sha256(text))
-        self.write(lambda connection: connection.execute(query), study_id, term)
+
+        def change(connection: Connection) -> None:
+            connection.execute(query)
+            for trial in trials:
+                where = (schema.trial.c.study_id == study_id, schema.trial.c.number == trial.number)
+                connection.execute(update(schema.trial).where(*where).values(trial_row(trial)))
+
+        self.write(change, study_id, term)
 
     def add_trials(self, study_id: int, trials: Sequence[Trial], *, term: int | None = None) -> None:
         """Record trials as running, all or none. Their numbers must go on where the stored ones end."""
