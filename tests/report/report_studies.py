@@ -38,6 +38,16 @@ class LocalSobol:
         return thetas[len(trials) : len(trials) + n]
 
 
+@dataclass(frozen=True)
+class Given:
+    """The thetas that a test wants tried."""
+
+    thetas: tuple[tuple[float, ...], ...]
+
+    def ask(self, space, trials, n=1):
+        return np.array(self.thetas[len(trials) : len(trials) + n])
+
+
 def charging(tuner="sobol", *, tolerance_V=0.0005):
     """A configuration that tunes a backoff, R0 and R1; all have one structure, so that one compilation serves every test."""
     return Config(

@@ -4,7 +4,8 @@ from report_studies import other_study
 
 from chargetune.battery.charging.evaluate import evaluate
 from chargetune.report import read_study
-from chargetune.report.sensitivity import STEP, again, finite_differences, rank_correlations
+from chargetune.report.best_possible import best_possible
+from chargetune.report.sensitivity import STEP, again, finite_differences, importance, rank_correlations
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +65,22 @@ def test_rank_correlation_by_hand(tmp_path):
 
 def test_too_few_trials_have_no_correlation(stores):
     assert rank_correlations(read_study(stores["mixed"], "charge", trials=7)) == {}
+
+
+def test_importance_is_what_putting_back_loses(view):
+    found = {one.entry: one for one in importance(view, view.tuned)}
+    assert set(found) == {*view.space.entries, "backoff_V[all]", "R0_ratio[all]", "R1_ratio[all]"}
+    theta = np.array(view.tuned.theta)
+    theta[view.space.slices["R1_ratio"]] = 1.0
+    score, _, _ = evaluate(view.problem, theta, view.tuned.seed)
+    assert found["R1_ratio[all]"].lost == pytest.approx(view.tuned.score.objective - score.objective, abs=1e-9)
+    sizes = [abs(one.lost) for one in importance(view, view.tuned)]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def test_nothing_is_better_than_the_best_possible(view, tmp_path):
+    possible = best_possible(view)
+    kept = [-t.score.objective for t in view.trials if t.score is not None and t.feasible]
+    assert len(kept) > 1
+    assert 0 < possible <= min(kept) + 1e-9
+    assert best_possible(read_study(other_study(tmp_path / "o.sqlite", "crane"), "crane")) is None

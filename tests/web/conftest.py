@@ -17,8 +17,6 @@ from report_studies import charging, other_study, run_charging
 from chargetune.web.app import make_app
 
 TIMEOUT_MS = 20_000
-# A style of the maps in plotly.js, which no figure here has: the policy refuses it, and the browser says so.
-EXPECTED = "Applying inline style violates"
 
 
 @pytest.fixture(scope="session")
@@ -65,7 +63,7 @@ def open_page(chromium):
         page.set_default_timeout(TIMEOUT_MS)
         page.wrong = []
         page.on("pageerror", lambda error: page.wrong.append(str(error)))
-        page.on("console", lambda m: page.wrong.append(m.text) if m.type == "error" and EXPECTED not in m.text else None)
+        page.on("console", lambda m: page.wrong.append(m.text) if m.type == "error" else None)
         page.on("dialog", lambda dialog: (page.wrong.append("a script of the store ran"), dialog.dismiss()))
         page.goto(address)
         if wait:

@@ -7,6 +7,10 @@ from report_studies import HOSTILE, TRIALS
 from chargetune.report import read_study, report_page
 
 DRAWN = "html[data-drawn]"
+# What the buttons of a figure may do: nothing that sends it anywhere.
+BUTTONS = ["Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Reset axes"]
+SHOWN = """() => [...document.querySelectorAll('.plot')].map(
+  (plot) => [...plot.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title || button.getAttribute('aria-label')))"""
 
 
 @pytest.fixture(scope="module")
@@ -134,4 +138,32 @@ def test_report_opens_from_a_file_without_a_network(open_page, store, tmp_path, 
     assert page.evaluate("document.documentElement.scrollWidth") == width
     assert page.evaluate("performance.getEntriesByType('resource').length") == 0
     assert page.locator("#drawing").count() == 0
+    assert page.wrong == []
+
+
+@pytest.mark.parametrize("kind", ["report", "live"])
+def test_no_button_sends_a_figure_anywhere(open_page, address, store, tmp_path, kind):
+    file = tmp_path / "report.html"
+    if kind == "report":
+        file.write_text(report_page(read_study(store, "charge"), evaluate=False), encoding="utf-8")
+    page = open_page(file.as_uri() if kind == "report" else f"{address}/studies/1", wait=DRAWN)
+    shown = page.evaluate(SHOWN)
+    assert len(shown) > 4
+    assert all(buttons == BUTTONS for buttons in shown), shown
+    sends = page.evaluate("() => [...document.querySelectorAll('.plot')].map((plot) => plot._context.plotlyServerURL)")
+    assert set(sends) == {""}
+    assert page.wrong == []
+
+
+def test_a_filter_shows_some_trials_and_theta_can_stand_in_the_table(open_page, address, store):
+    page, view = open_page(f"{address}/studies/1", wait="#rows tr"), read_study(store, "charge")
+    assert page.locator("th[data-key^='theta ']").count() == 0
+    page.locator("#with-theta").check()
+    assert page.locator("th[data-key^='theta ']").count() == view.space.dimension
+    entry, bound = view.space.entries[0], float(np.median([t.theta[0] for t in view.trials]))
+    page.locator("#filter").fill(f"{entry} > {bound}")
+    assert sorted(map(int, column(page, 1))) == [t.number for t in view.trials if t.theta[0] > bound]
+    page.locator("#filter").fill("")
+    page.locator("#kind").select_option("failed")
+    assert sorted(map(int, column(page, 1))) == [3, 6]
     assert page.wrong == []

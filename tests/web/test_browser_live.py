@@ -16,10 +16,13 @@ from chargetune.study.trial import Trial
 TOKEN = "correct horse battery"
 # Which of 3000 trials are drawn as points, when 1234 has the largest loss and 777 the smallest excess.
 MANY = """async () => {
-  const row = (number) => ({ number, status: "done", loss: 2 + Math.sin(number), excess: Math.cos(number), feasible: true, counted: true });
+  const name = head.excesses[0].name;
+  const row = (number) => ({
+    number, status: "done", value: 2 + Math.sin(number), excesses: { [name]: Math.cos(number) }, feasible: true, counted: true,
+  });
   const rows = Array.from({ length: 3000 }, (_, number) => row(number)), node = document.createElement("div");
-  rows[1234].loss = 99;
-  rows[777].excess = -55;
+  rows[1234].value = 99;
+  rows[777].excesses[name] = -55;
   document.body.append(node);
   await Figures.convergence(node, head, rows);
   return node.data.filter((trace) => trace.name === "within limits").map((trace) => trace.x);

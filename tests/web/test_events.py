@@ -50,7 +50,7 @@ def test_a_study_is_told_whole_and_then_what_is_new(path):
         name, first = await following(stream)
         assert name == "trials"
         assert [row["number"] for row in first["rows"]] == list(range(TRIALS))
-        assert first["untuned"] == 0
+        assert (first["start"], first["start_label"]) == (0, "untuned")
         tell(path, TRIALS, theta, finish=False)
         _, news = await following(stream)
         assert [(row["number"], row["status"]) for row in news["rows"]] == [(TRIALS, "running")]
@@ -102,7 +102,7 @@ def test_a_study_without_trials_yet(tmp_path):
         stream = study_events(StoreWatch(path), 1)
         assert (await following(stream))[0] == "study"
         assert (await following(stream))[1] == {
-            "rows": [], "untuned": None, "tuned": None, "tuned_label": "tuned",
+            "rows": [], "start": None, "start_label": "untuned", "tuned": None, "tuned_label": "tuned",
             "result": {"trial": None, "reason": "none", "asked": True, "sentence": "no trial has a score"},
         }  # fmt: skip
         tell(path, 0, tuple(config.problem().space.default), finish=False)

@@ -165,13 +165,16 @@ def simulate(
         str | None, typer.Option(help='Values: "0.1,0.1,..." or JSON by name: \'{"backoff_V": [...]}\'. The file\'s by default.')
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbances.")] = 0,
+    figure: Annotated[Path | None, typer.Option(help="Figure of the run to write (png, pdf, svg).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Trace of the run to write (CSV), one row an interval.")] = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Run one closed loop of a study file at one theta."""
     _read_first(config, "study")
     from chargetune.cli.simulate import simulate_command
 
-    simulate_command(config, theta=theta, seed=seed, as_json=as_json)
+    simulate_command(config, theta=theta, seed=seed, figure=figure, out=out, overwrite=overwrite, as_json=as_json)
 
 
 @app.command()
@@ -195,13 +198,18 @@ def report(
     evaluate: Annotated[
         bool, typer.Option(help="Evaluate the best theta and its neighbours on a simulated plant, for the sensitivities.")
     ] = True,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of the study; by default the one beside the store, where it is of this study.")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write one study as a self-contained HTML page, which opens offline."""
     from chargetune.cli.report import report_command
 
-    report_command(store, study=study, out=out, figures=figures, evaluate=evaluate, overwrite=overwrite, as_json=as_json)
+    report_command(
+        store, study=study, out=out, figures=figures, evaluate=evaluate, certificate=certificate, overwrite=overwrite, as_json=as_json
+    )
 
 
 @app.command()

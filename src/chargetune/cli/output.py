@@ -3,47 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console, JustifyMethod
+from rich.console import Console
 from rich.table import Table
 
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.wording import limit_words, metric_words, objective_words
 from chargetune.episode.score import Score
 from chargetune.study.executors import bounded_workers
 from chargetune.study.result import StudyResult
 from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
-from chargetune.study.trial import Trial
 
-__all__ = [
-    "beside",
-    "console",
-    "metrics_table",
-    "number",
-    "plants_over",
-    "result_line",
-    "shown",
-    "theta_lines",
-    "trials_table",
-    "workers_for",
-]
+__all__ = ["beside", "console", "loss_of", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "workers_for"]
 
-ROWS = (
-    ("overshoot_mV", "worst voltage over the limit", "mV"),
-    ("overshoot_mVs", "its integral", "mV s"),
-    ("t80_min", "time to 80 % SOC", "min"),
-    ("t90_min", "time to 90 % SOC", "min"),
-    ("t95_min", "time to 95 % SOC", "min"),
-    ("t99_min", "time to 99 % SOC", "min"),
-    ("switch_min", "end of constant current", "min"),
-    ("soc_end", "SOC at the end", ""),
-    ("solver_failures", "control steps not solved to tolerance", ""),
-)
-
-# Of these figures those that a study has.
-COLUMNS = (("overshoot_mV", "overshoot mV"), ("t80_min", "t80 min"), ("t95_min", "t95 min"), ("unsolved_percent", "unsolved %"))
+# Figures of a charge beside its objective and its limits.
+ROWS = ("t80_min", "t90_min", "t95_min", "t99_min", "switch_min", "soc_end", "violation_mVs", "solver_failures")
 
 
 def console(*, stderr: bool = False) -> Console:
@@ -76,21 +53,47 @@ def result_line(result: StudyResult) -> str:
     return f"{which}: {result.sentence}"
 
 
-def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem) -> Table:
-    """One column a run, one row a figure."""
+def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem, tuner: str = "") -> Table:
+    """One column a run; a row for the objective, for each limit, and for each further figure of a charge."""
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     for name in scores:
         table.add_column(name, justify="right")
+    table.add_column("tolerance", justify="right")
     table.add_column("")
-    for key, label, unit in ROWS:
-        table.add_row(label, *(number(s.metrics.get(key)) if s else "-" for s in scores.values()), unit)
-    if any(s and "plants" in s.metrics for s in scores.values()):
-        counts = map(plants_over, scores.values())
-        table.add_row("drawn plants over a limit; the figures above are their means, over a limit their worst", *counts, "")
-    verdict = [("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in scores.values()]
-    table.add_row(f"limits ({problem.voltage_min_V:g} V to {problem.voltage_max_V:g} V)", *verdict, "")
+    runs = list(scores.values())
+
+    def row(label: str, values: Iterable[str], unit: str, tolerance: str = "") -> None:
+        table.add_row(label, *values, tolerance, unit)
+
+    objective = objective_words(problem, tuner)
+    row(f"objective: {objective.label}", (objective.text(loss_of(s, tuner)) if s else "-" for s in runs), objective.unit)
+    for limit in problem.limits_by_name.values():
+        words = limit_words(problem, limit)
+        excess = [f"{words.factor * s.excess[words.name]:.2f}" if s and words.name in s.excess else "-" for s in runs]
+        allowed = next((f"{words.factor * s.tolerance[words.name]:.3g}" for s in runs if s and words.name in s.tolerance), "")
+        if words.samples == 1 or not words.largest or any(s and "plants" in s.metrics for s in runs):
+            row(words.label, excess, words.unit, allowed)
+            continue
+        table.add_row(words.label)
+        row(f"  {words.judged}", excess, words.unit, allowed)
+        row("  largest sample", (number(s.metrics.get(words.largest)) if s else "-" for s in runs), words.unit)
+    told = f"{objective.short}_{objective.unit}"
+    for key in ROWS:
+        if key != told and any(s and s.metrics.get(key) is not None for s in runs):
+            label, unit = metric_words(key)
+            row(label, (number(s.metrics.get(key)) if s else "-" for s in runs), unit)
+    if any(s and "plants" in s.metrics for s in runs):
+        counts = map(plants_over, runs)
+        row("drawn plants over a limit", counts, "")
+        table.add_row("  above: their means, of limits the worst")
+    row("limits", (("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in runs), "")
     return table
+
+
+def loss_of(score: Score, tuner: str = "") -> float:
+    """What the tuner makes small."""
+    return -(score.performance if tuner == "ei" else score.objective)
 
 
 def plants_over(score: Score | None) -> str:
@@ -112,27 +115,3 @@ def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[floa
     return "\n".join(
         f"  {name} = {value:.5g} {'' if unit == '1' else unit}".rstrip() for name, unit, value in zip(names, units, theta, strict=True)
     )
-
-
-def trials_table(trials: Sequence[Trial]) -> Table:
-    """One row a trial, with the share of its control steps that were not solved."""
-    told = {name for t in trials if t.score for name in t.score.metrics}
-    figures = [(name, label) for name, label in COLUMNS if name in told]
-    table = Table(box=None, pad_edge=False)
-    drawn = any(t.score is not None and "plants" in t.score.metrics for t in trials)
-    of_range = ["plants over"] if drawn else []
-    for heading in ("trial", "status", *(label for _, label in figures), "G", *of_range, "limits", "ending"):
-        side: JustifyMethod = "left" if heading in ("status", "limits", "ending") else "right"
-        table.add_column(heading, justify=side, no_wrap=heading in of_range)
-    for t in trials:
-        s = t.score
-        table.add_row(
-            str(t.number),
-            t.status.value,
-            *(number(s.metrics.get(name)) if s else "-" for name, _ in figures),
-            f"{s.performance:.4g}" if s else "-",
-            *([plants_over(s)] if drawn else []),
-            ("kept" if s.feasible else "[red]broken[/]") if s else "-",
-            t.ending or "",
-        )
-    return table

@@ -9,7 +9,8 @@ from chargetune.cli.output import beside, console, shown
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
 from chargetune.report import figure_names, read_study, save_figures
-from chargetune.report.page.page import report_page
+from chargetune.report.page.evidence_sections import certificate_of
+from chargetune.report.page.page import evaluations, report_page
 from chargetune.report.study_view import read_studies
 from chargetune.study.files import write_whole
 
@@ -17,7 +18,15 @@ __all__ = ["report_command"]
 
 
 def report_command(
-    location: str, *, study: str | None, out: Path | None, figures: Path | None, evaluate: bool, overwrite: bool, as_json: bool
+    location: str,
+    *,
+    study: str | None,
+    out: Path | None,
+    figures: Path | None,
+    evaluate: bool,
+    overwrite: bool,
+    as_json: bool,
+    certificate: Path | None = None,
 ) -> None:
     """Write the page, and with ``figures`` the figures of a paper."""
     if study is None:
@@ -30,10 +39,15 @@ def report_command(
     claim([page], inputs=[location], overwrite=overwrite, folders=False)
     view = read_study(location, study)
     vectors = [] if figures is None else [Output("--figures", figures / f"{stem}.pdf", Kind.PDF) for stem in figure_names(view)]
-    claim([page, *vectors], inputs=[location], overwrite=overwrite)
+    claim([page, *vectors], inputs=[location, *([certificate] if certificate else [])], overwrite=overwrite)
+    others = [one for one in read_studies(location) if one.name != study and one.trials]
+    found = certificate_of(view, certificate or beside(location, "-certificate.json"))
+    if certificate is not None and found is None:
+        raise ValueError(f"--certificate {certificate}: allowed is a certificate of study {study!r} as it is now")
     with bar(quiet=as_json) as progress:
-        task = progress.add_task("sensitivities", total=view.space.dimension, note="")
-        write_whole(target, report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task)))
+        task = progress.add_task("sensitivities", total=evaluations(view), note="")
+        text = report_page(view, evaluate=evaluate, progress=lambda: progress.advance(task), others=others, certified=found)
+        write_whole(target, text)
         progress.remove_task(task)
     drawn = save_figures(location, study, figures, ("pdf",)) if figures is not None else []
     if as_json:

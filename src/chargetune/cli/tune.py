@@ -19,13 +19,15 @@ from rich.table import Column
 
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.verdict import charge_time, violation_mVs
+from chargetune.battery.charging.verdict import violation_mVs
+from chargetune.battery.charging.wording import objective_words
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, metrics_table, number, result_line, shown, theta_lines, workers_for
+from chargetune.cli.output import console, loss_of, metrics_table, number, result_line, shown, theta_lines, workers_for
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
+from chargetune.episode.score import Score
 from chargetune.runtime.notes import first_line
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
@@ -82,7 +84,7 @@ def tune_command(
     opening = Opening(config, path.parent, kept, accept_changed)
     everything, more, result, safety = _run(opening, problem, count, workers, quiet=as_json)
     now = [t for t in everything if t.status is not TrialStatus.APART]
-    summary = {**_summary(config, now, result, problem.space.entries), "trials": len(everything), "apart": len(everything) - len(now)}
+    summary = {**_summary(config, problem, now, result), "trials": len(everything), "apart": len(everything) - len(now)}
     summary |= {"safety": safety} if safety else {}
     figures: list[Path] = []
     if out is not None:
@@ -95,7 +97,7 @@ def tune_command(
         print(json.dumps(summary))  # noqa: T201
         _end(safety, now)
         return
-    _closing(problem, now, result)
+    _closing(problem, now, result, config.study.tuner)
     if more:
         console().print(f"the study has {len(everything) + more} trials; these are the first {len(everything)} of them, as --trials asks")
     if safety:
@@ -157,8 +159,7 @@ def _run(
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none within the limits yet"
             if incumbent is not None and incumbent.score is not None:
-                name, minutes = charge_time(problem, incumbent.score)
-                best = f"best {name} {number(minutes)} min (trial {incumbent.number})"
+                best = f"best {_headline(config, problem, incumbent.score)} (trial {incumbent.number})"
             progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
 
         stack.enter_context(_said(progress.console))
@@ -178,6 +179,15 @@ def _run(
         study.result()
         result = read_result(store, study.record, everything)
     return everything, more, result, safety
+
+
+def _headline(config: Config, problem: ChargingProblem, score: Score) -> str:
+    """What a trial is worth: the objective where it is a time; else the time to 95 % SOC, where that was reached."""
+    words = objective_words(problem, config.study.tuner)
+    t95 = score.metrics.get("t95_min")
+    if words.unit or t95 is None:
+        return f"{words.short} {words.text(loss_of(score, config.study.tuner))} {words.unit}".rstrip()
+    return f"t95 {number(t95)} min"
 
 
 @contextmanager
@@ -226,7 +236,16 @@ def _check(problem: ChargingProblem, start: NDArray[np.float64] | None, *, force
         raise ValueError("the formulation has an error; `chargetune check` shows it, --force tunes nevertheless")
 
 
-def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyResult) -> None:
+def _start_label(problem: ChargingProblem, trials: Sequence[Trial]) -> str:
+    """What trial 0 is: a safe study does not begin with the untuned controller."""
+    if not trials or np.array_equal(trials[0].theta, problem.space.default):
+        return "untuned"
+    if problem.safety is None:
+        return "trial 0"
+    return "declared start" if problem.safe_start is not None else "cautious start"
+
+
+def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyResult, tuner: str = "") -> None:
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
@@ -241,20 +260,21 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
         screen.print(result_line(result), markup=False, soft_wrap=True)
         return
     first = everything[0].score if everything else None
-    # A safe study does not begin with the untuned controller.
-    label = "untuned" if not everything or np.array_equal(everything[0].theta, problem.space.default) else "start"
-    screen.print(metrics_table({label: first, "tuned": best.score if best else None}, problem))
+    scores = {_start_label(problem, everything): first, "tuned": best.score if best else None}
+    screen.print(metrics_table(scores, problem, tuner))
     if best is None:
         return
     if not best.feasible:
-        screen.print("[red]No trial kept the limits.[/] Shown is the one that came closest. More trials or a wider theta may help.")
+        said = f"[red]None of these {len(everything)} trials kept the limits.[/] Shown is the one that came closest."
+        screen.print(f"{said} More trials or a wider theta may help.")
     units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
     screen.print(result_line(result), markup=False, soft_wrap=True)
     screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
 
 
-def _summary(config: Config, trials: list[Trial], result: StudyResult, names: tuple[str, ...]) -> dict[str, Any]:
-    best = result.trial
+def _summary(config: Config, problem: ChargingProblem, trials: list[Trial], result: StudyResult) -> dict[str, Any]:
+    best, label = result.trial, _start_label(problem, trials)
+    first = trials[0] if trials else None
 
     def facts(trial: Trial | None) -> dict[str, Any] | None:
         if trial is None or trial.score is None:
@@ -274,8 +294,9 @@ def _summary(config: Config, trials: list[Trial], result: StudyResult, names: tu
         "trials": len(trials),
         "violating": sum(t.score is not None and not t.score.feasible for t in trials),
         "failed": sum(t.status is TrialStatus.FAILED for t in trials),
-        "untuned": facts(trials[0]) if trials else None,
+        "untuned": facts(first) if label == "untuned" else None,
+        "start": None if first is None else {"what": label, **(facts(first) or {"trial": first.number})},
         "tuned": facts(best),
         "result": result.facts(),
-        "theta": dict(zip(names, best.theta, strict=True)) if best else None,
+        "theta": dict(zip(problem.space.entries, best.theta, strict=True)) if best else None,
     }

@@ -48,8 +48,11 @@ class Proposal:
 
         Of many candidates that are judged by the same plants those are found that just these allow: their share says too much.
         """
-        fresh = self.ensemble.predict(theta, self.seed + FRESH, self.ensemble.settings.judges)
-        return fresh.probability() >= self.probability
+        return self.fresh(theta).probability() >= self.probability
+
+    def fresh(self, theta: NDArray[np.float64]) -> Prediction:
+        """What `holds` judges by: theta on plants of their own seed."""
+        return self.ensemble.predict(theta, self.seed + FRESH, self.ensemble.settings.judges)
 
     def accepts(self, candidate: Candidate) -> bool:
         """Whether it keeps every limit on the share of the ensemble that is asked for."""

@@ -14,7 +14,7 @@ from chargetune.report.study_view import StudyView
 from chargetune.study.evaluation import Evaluate
 from chargetune.study.trial import Trial
 
-__all__ = ["STEP", "Sensitivity", "again", "finite_differences", "rank_correlations"]
+__all__ = ["STEP", "Importance", "Sensitivity", "again", "finite_differences", "importance", "rank_correlations"]
 
 # Share of an entry's range (logarithmic for a log scale) by which it is moved.
 STEP = 0.02
@@ -33,6 +33,42 @@ class Sensitivity:
     minutes: tuple[float | None, float | None]
     objective: tuple[float | None, float | None]
     excess: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Importance:
+    """What is lost when an entry of theta, or with ``[all]`` a whole parameter, is put back to its untuned value.
+
+    ``lost``: by how much the objective becomes smaller; ``excess``: change of the worst excess, as `worst_excess` compares them.
+    Both are None where that charge has no score.
+    """
+
+    entry: str
+    lost: float | None
+    excess: float | None
+
+
+def importance(view: StudyView, trial: Trial, progress: Callable[[], None] = lambda: None) -> list[Importance]:
+    """One evaluation for each parameter of several entries and for each entry, with the seed of ``trial``, the largest loss first.
+
+    Raises ValueError for a study that is not one of battery charging.
+    """
+    evaluate, space, theta = _evaluation(view), view.space, np.array(trial.theta)
+    base, _, _ = evaluate(theta, trial.seed)
+    parts = [(f"{name}[all]", part) for name, part in space.slices.items() if part.stop - part.start > 1]
+    parts += [(entry, slice(i, i + 1)) for i, entry in enumerate(space.entries)]
+    out = []
+    for name, part in parts:
+        back = theta.copy()
+        back[part] = space.default[part]
+        score = evaluate(back, trial.seed)[0] if not np.array_equal(back, theta) else base
+        if score is None or base is None:
+            out.append(Importance(name, None, None))
+        else:
+            excess = worst_excess(view, score) - worst_excess(view, base)
+            out.append(Importance(name, base.objective - score.objective, excess))
+        progress()
+    return sorted(out, key=lambda one: -abs(one.lost or 0.0))
 
 
 def again(view: StudyView, trial: Trial) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -75,6 +76,32 @@ class StudyView:
         return next((t for t in self.trials if t.status is not TrialStatus.APART and np.array_equal(t.theta, default)), None)
 
     @property
+    def start(self) -> Trial | None:
+        """What the tuned trial is held against: the untuned one, else the first, which a safe study begins with."""
+        return self.untuned or next((t for t in self.trials if t.number == 0), None)
+
+    @property
+    def start_label(self) -> str:
+        """What a legend calls `start`: only theta_0 is untuned."""
+        if self.untuned is not None or not self.trials:
+            return "untuned"
+        problem = self.problem
+        if problem is None or problem.safety is None:
+            return "first trial"
+        return "declared start" if problem.safe_start is not None else "cautious start"
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """Unit of every signal in the first trace that can be read, by name; empty without one."""
+        traced = [t for t in self.trials if t.trace_sha256 is not None]
+        for reading in self.readings(traced) if traced else ():
+            episode = reading.episode
+            if episode is not None:
+                names = (*episode.input_names, *episode.output_names)
+                return dict(zip(names, (*episode.input_units, *episode.output_units), strict=True))
+        return {}
+
+    @property
     def tuned(self) -> Trial | None:
         """The trial that is the study's result; it need not have kept the limits. None without a score."""
         return self.result.trial
@@ -86,13 +113,13 @@ class StudyView:
 
     @property
     def tuned_dashes(self) -> str:
-        """Line style of the tuned run: dashed when it is the untuned one too, which then shows through."""
-        return "--" if self.tuned is not None and self.tuned is self.untuned else "-"
+        """Line style of the tuned run: dashed when it is the start too, which then shows through."""
+        return "--" if self.tuned is not None and self.tuned is self.start else "-"
 
     @property
     def others(self) -> tuple[Trial, ...]:
-        """Told trials that are neither the untuned nor the tuned one, the failed ones included."""
-        apart = [t.number for t in (self.untuned, self.tuned) if t is not None]
+        """Told trials that are neither the start nor the tuned one, the failed ones included."""
+        apart = [t.number for t in (self.start, self.tuned) if t is not None]
         return tuple(t for t in self.trials if t.status in (TrialStatus.DONE, TrialStatus.FAILED) and t.number not in apart)
 
     def episodes(self, trials: Iterable[Trial]) -> Iterator[tuple[Trial, Episode]]:

@@ -48,7 +48,7 @@ def make_app(
     """
     watch = StoreWatch(store)
     files = _files()
-    pages = {name: _own(name) for name in ("index.html", "study.html")}
+    pages = {"index.html": _own("index.html"), "study.html": _own("study.html").replace(b"<!-- styles -->", _no_styles())}
 
     async def index(_request: Request) -> Response:
         return Response(pages["index.html"], media_type="text/html")
@@ -141,6 +141,16 @@ def _attachment(view: StudyView, trial: Trial, kind: str) -> dict[str, str]:
     return {"content-disposition": f'attachment; filename="{plain}-trial-{trial.number}.{kind}"'}
 
 
+@cache
+def _no_styles() -> bytes:
+    """Empty elements with the ids of the style elements that plotly.js makes for maps: it makes none where there is one already.
+
+    No figure here is a map, and the policy of the page refuses such an element, with an error in the browser's console.
+    """
+    ids = dict.fromkeys(re.findall(rb'getElementById\("([0-9a-f]{64})"\)', plotly_js()))
+    return b"".join(b'<meta id="' + found + b'">' for found in ids)
+
+
 def _own(name: str) -> bytes:
     return resources.files("chargetune.web").joinpath("static", name).read_bytes()
 
@@ -148,7 +158,7 @@ def _own(name: str) -> bytes:
 @cache
 def _files() -> dict[str, tuple[dict[str, bytes], str]]:
     """Every file that a page may ask for: its content by encoding, and its type."""
-    contents = {name: static(name).encode() for name in ("look.css", "figures.js")}
+    contents = {name: static(name).encode() for name in ("look.css", "figures.js", "trials.js")}
     contents |= {name: _own(name) for name in ("index.js", "study.js")}
     contents["plotly.js"] = plotly_js()
     return {name: ({"": c, "gzip": gzip.compress(c, 6)}, TYPES[name.rpartition(".")[2]]) for name, c in contents.items()}

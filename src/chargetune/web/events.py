@@ -69,13 +69,14 @@ async def study_events(watch: StoreWatch, study_id: int, ending: Ending = _never
         if fresh or not sent or told != result:
             result = told
             rows = await asyncio.to_thread(trial_rows, view, fresh)
-            untuned, tuned = view.untuned, view.tuned
+            start, tuned = view.start, view.tuned
             sent |= {t.number: t.status for t in fresh}
             yield _event(
                 "trials",
                 {
                     "rows": rows,
-                    "untuned": None if untuned is None else untuned.number,
+                    "start": None if start is None else start.number,
+                    "start_label": view.start_label,
                     "tuned": None if tuned is None else tuned.number,
                     "tuned_label": view.tuned_label,
                     "result": result,

@@ -42,10 +42,12 @@ def test_excesses_of_different_units_are_compared_in_tolerances():
     assert view.tuned.number == 1
     assert [worst_excess(view, score) for score in scores] == pytest.approx([499.0, 1.5, -5.0])
     assert excess_unit(view)[1] == 1.0
-    lower = convergence_figure(view).axes[1]
-    assert "tolerances" in lower.get_ylabel()
-    assert [row["excess"] for row in trial_rows(view, trials)] == pytest.approx([499.0, 1.5, -5.0])
-    assert study_head(view)["tolerance"] is None
+    # In the figure each limit has an axis of its own, in its own unit.
+    upper, *lowers = convergence_figure(view).axes
+    assert [len(axis.lines[0].get_ydata()) + len(axis.lines[1].get_ydata()) for axis in (upper, *lowers)] == [3, 3, 3]
+    assert [list(row["excesses"].values()) for row in trial_rows(view, trials)] == [list(pair) for pair in excesses]
+    head = study_head(view)["excesses"]
+    assert [(one["name"], one["tolerance"]) for one in head] == list(tolerance.items())
     # Voltages of one tolerance are compared as they are, and told in mV.
     volts = tuple(
         replace(
@@ -76,6 +78,8 @@ NAN = np.nan
 def test_incumbents(tuner, best):
     view = view_of(TABLE, tuner)
     np.testing.assert_array_equal(incumbents(view), best)
+    # An objective of a program's own is shown as it is: larger is better.
+    best = best if tuner == "ei" else [-value for value in best]
     (line,) = [x for x in lines(convergence_figure(view).axes[0], ORANGE) if x.get_drawstyle() == "steps-post"]
     np.testing.assert_array_equal(line.get_xdata(), range(7))
     np.testing.assert_array_equal(line.get_ydata(), best)
@@ -86,10 +90,10 @@ def test_marks_say_what_became_of_each_trial():
     upper, lower = figure.axes
     shown = {line.get_label(): line for line in upper.lines}
     for label, marker, color, numbers, values in (
-        ("within limits", "o", GREEN, [1, 4, 5], [4.0, 2.0, 2.5]),
-        ("violating", "^", RED, [0, 3], [1.0, 3.0]),
-        ("untuned", "s", BLUE, [0], [1.0]),
-        ("tuned", "o", ORANGE, [4], [2.0]),
+        ("within limits", "o", GREEN, [1, 4, 5], [-4.0, -2.0, -2.5]),
+        ("violating", "^", RED, [0, 3], [-1.0, -3.0]),
+        ("untuned", "s", BLUE, [0], [-1.0]),
+        ("tuned", "o", ORANGE, [4], [-2.0]),
     ):
         assert shown[label].get_marker() == marker
         assert shown[label].get_color() == color
@@ -103,14 +107,19 @@ def test_marks_say_what_became_of_each_trial():
     assert list(shown["failed"].get_xdata()) == [2]
     assert shown["failed"].get_marker() == "x"
     assert legend(figure) == ["within limits", "violating", "untuned", "tuned", "failed", "best so far", "limit", "tolerance"]
-    assert (upper.get_ylabel(), lower.get_ylabel(), lower.get_xlabel()) == ("−objective", "worst excess (unit of the limit)", "trial")
+    labels = [axis.get_ylabel().replace("\n", " ") for axis in (upper, lower)]
+    assert [*labels, lower.get_xlabel()] == ["objective (larger is better)", "speed beyond its limit", "trial"]
+    # The first and the last trial stand within the axis.
+    assert upper.get_xlim()[0] < 0
+    assert upper.get_xlim()[1] > 6
+    assert all(axis.xaxis.get_tick_params()["labelbottom"] for axis in figure.axes)
 
 
 @pytest.mark.parametrize(
     ("losses", "scale"), [([1.0, 2.0, 9.0], "linear"), ([1.0, 20.0, 3.0], "log"), ([0.0, 20.0], "linear"), ([-1.0, 20.0], "linear")]
 )
 def test_axis_is_logarithmic_where_that_helps(losses, scale):
-    figure = convergence_figure(view_of([(-v, -v, 0.0) for v in losses]))
+    figure = convergence_figure(view_of([(-v, -v, 0.0) for v in losses], "ei"))
     assert figure.axes[0].get_yscale() == scale
     figure.canvas.draw()
 
@@ -124,14 +133,16 @@ def test_only_failures():
 
 
 def test_failures_do_not_change_the_unit(stores):
-    assert convergence_figure(read_study(stores["failed"], "charge")).axes[1].get_ylabel() == "worst excess (mV)"
+    assert convergence_figure(read_study(stores["failed"], "charge")).axes[1].get_ylabel().replace("\n", " ") == "voltage over 4.2 V (mV)"
 
 
 def test_charging_study_in_its_units(stores):
     view = read_study(stores["mixed"], "charge")
     upper, lower = convergence_figure(view).axes
     assert upper.get_ylabel() == "mean of $(z_d - z)^2$"
-    assert lower.get_ylabel() == "worst excess (mV)"
+    assert lower.get_ylabel().replace("\n", " ") == "voltage over 4.2 V (mV)"
+    (possible,) = [line for line in upper.lines if line.get_label() == "best possible"]
+    assert 0 < possible.get_ydata()[0] < np.nanmin(incumbents(view))
     ring = next(line for line in lower.lines if line.get_label() == "tuned")
     (worst,) = ring.get_ydata()
     assert worst == pytest.approx(view.trials[8].score.metrics["overshoot_mV"], rel=1e-12)
@@ -152,7 +163,7 @@ def test_no_feasible_trial_leaves_no_incumbent(stores):
     view = read_study(stores["violating"], "charge")
     figure = convergence_figure(view)
     assert np.isnan(incumbents(view)).all()
-    assert legend(figure) == ["violating", "untuned", "tuned, violating", "limit", "tolerance"]
+    assert legend(figure) == ["violating", "untuned", "tuned, violating", "best possible", "limit", "tolerance"]
 
 
 def test_tolerances_that_differ_have_no_common_line():

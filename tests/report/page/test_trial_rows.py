@@ -29,10 +29,12 @@ def test_rows_say_what_the_trials_say(view):
     for row, trial in zip(trial_rows(view, view.trials), view.trials, strict=True):
         assert (row["number"], row["status"], row["trace"]) == (trial.number, trial.status, trial.trace_sha256 is not None)
         if trial.score is None:
-            assert (row["feasible"], row["loss"], row["excess"], row["metrics"], row["counted"]) == (None, None, None, {}, False)
+            assert (row["feasible"], row["value"], row["metrics"], row["counted"]) == (None, None, {}, False)
+            assert set(row["excesses"].values()) == {None}
         else:
-            assert row["loss"] == pytest.approx(-trial.score.objective)
-            assert row["excess"] == pytest.approx(1e3 * max(trial.score.excess.values()), rel=1e-6)
+            assert row["value"] == pytest.approx(-trial.score.objective)
+            assert row["excesses"] == {name: pytest.approx(1e3 * value, rel=1e-6) for name, value in trial.score.excess.items()}
+            assert row["theta"] == pytest.approx(list(trial.theta))
             assert row["counted"] == trial.feasible
 
 
@@ -40,20 +42,27 @@ def test_the_papers_method_counts_every_score(stores):
     view = read_study(stores["ei"], "charge")
     rows = trial_rows(view, view.trials)
     assert all(row["counted"] for row in rows)
-    assert rows[0]["loss"] == pytest.approx(-view.trials[0].score.performance)
+    assert rows[0]["value"] == pytest.approx(-view.trials[0].score.performance)
 
 
 def test_head_names_limits_and_theta(view):
     head = study_head(view)
     assert [x["name"] for x in head["limits"]] == ["current_min_A", "current_max_A", "voltage_max_V", "voltage_min_V"]
     assert [x["entry"] for x in head["theta"]] == list(view.space.entries)
-    assert (head["excess_unit"], head["tolerance"]) == ("mV", pytest.approx(35.0))
+    told = [(x["label"], x["unit"], x["tolerance"], x["drawn"]) for x in head["excesses"]]
+    assert told == [("voltage over 4.2 V", "mV", pytest.approx(35.0), True), ("voltage under 2.5 V", "mV", pytest.approx(35.0), False)]
+    assert head["metrics"]["t80_min"] == ["time to 80 % SOC", "min"]
 
 
 def test_the_loss_is_named_by_what_is_minimised(view):
     timed = changed(view.problem, charge_time_to_soc=0.8)
     views = [view, replace(view, tuner="ei"), replace(view, problem=timed), replace(view, problem=None)]
-    assert [study_head(v)["loss_label"] for v in views] == ["mean of (z_d - z)²", "-G", "time to 0.8 SOC / duration", "-objective"]
+    assert [study_head(v)["objective"]["label"] for v in views] == [
+        "mean of (z_d - z)^2", "-G", "time to 80 % SOC (min)", "objective (larger is better)",
+    ]  # fmt: skip
+    # Minutes, not shares of the episode.
+    share = -view.trials[0].score.objective
+    assert trial_rows(views[2], view.trials)[0]["value"] == pytest.approx(share * 150 * 10 / 60, rel=1e-6)
 
 
 def test_summary(stores):

@@ -19,7 +19,10 @@ from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
-__all__ = ["CCCV", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "row_names", "smallest_that_keeps"]
+__all__ = [
+    "CCCV", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "plant_oracle", "row_names",
+    "smallest_that_keeps",
+]  # fmt: skip
 
 # CC-CV at the fastest rate with which every limit is kept.
 CCCV = "CC-CV that keeps all limits"
@@ -108,6 +111,11 @@ def compare(
         return
     tasks: list[Future[Row]] = [executor.submit(_row, problem, name, theta, seed) for name in names]
     yield from (task.result() for task in as_completed(tasks))
+
+
+def plant_oracle(problem: ChargingProblem) -> Row | None:
+    """The charge at the largest current that keeps every limit in each interval; None where an interval of the plant cannot be tried."""
+    return _row(problem, "plant oracle", None, 0) if as_steppable(plant_of(problem)) is not None else None
 
 
 def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, seed: int) -> Row:

@@ -29,7 +29,7 @@ CONDITIONS = {
 
 
 def certificate_figure(path: str | os.PathLike[str]) -> Figure:
-    """Upper row: worst excess of each episode and limit. Lower row: time until a SOC is reached. Both over the share of the episodes.
+    """Over the share of the episodes, one row a unit: worst excess of each episode and limit, below 0 kept; last the time to a SOC.
 
     A further column for each condition that differs, of start SOC, ambient temperature and age, shows each episode over it; a red
     cross is an episode that violates. Raises ValueError, OSError for files that cannot be read.
@@ -47,33 +47,45 @@ def certificate_figure(path: str | os.PathLike[str]) -> Figure:
     broken = np.any([~arrays["completed"].astype(bool), *over], axis=0)
     conditions = {name: drawn[:, 0] for name in CONDITIONS if (drawn := arrays.get(f"drawn.{name}")) is not None and np.ptp(drawn)}
     share = 100 * np.arange(1, count + 1) / count
+    units = list(dict.fromkeys(_unit(limit["name"])[1] for limit in limits))
     with journal_style():
         columns = 1 + len(conditions)
-        figure, axes = new_figure(PAGE_IN, 4.2, 2, columns, sharex="col", sharey="row")
-        upper, lower = axes[:columns], axes[columns:]
+        rows = [*units, "min"]
+        figure, axes = new_figure(PAGE_IN, 0.6 + 1.8 * len(rows), len(rows), columns, sharex="col", sharey="row")
+        row_of = {unit: axes[i * columns : (i + 1) * columns] for i, unit in enumerate(rows)}
+        lower = row_of["min"]
         handles: list[Any] = []
-        for limit, values, bound, beyond, color in zip(limits, excess, bounds, over, (BLUE, ORANGE, GREEN), strict=False):
-            label = f"{limit['name'].rpartition('_')[0].replace('_', ' ')} ({_unit(limit['name'])[1]})"
-            handles += upper[0].plot(share, np.sort(values), color=color, label=label)
-            dashes = [axis.axhline(bound, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, label="tolerance") for axis in upper]
+        for k, (limit, values, bound, beyond, color) in enumerate(zip(limits, excess, bounds, over, (BLUE, ORANGE, GREEN), strict=False)):
+            upper, what = row_of[_unit(limit["name"])[1]], limit["name"].rpartition("_")[0].replace("_", " ")
+            handles += upper[0].plot(share, np.sort(values), color=color, label=what)
+            # As many tolerances as there are limits, each in the colour of its own; equal ones show between each other's dashes.
+            dashes: dict[str, Any] = {"color": color, "linestyle": (4 * k, (4, 4)), "linewidth": 0.9, "label": f"its tolerance ({what})"}
+            line = [axis.axhline(bound, **dashes) for axis in upper]
+            handles.append(line[0])
             for axis, (name, drawn) in zip(upper[1:], conditions.items(), strict=True):
                 _points(axis, CONDITIONS[name][1] * drawn, values, beyond, color)
-        handles.append(dashes[0])
         for mark, color in MARKS:
             times = np.array([_minutes(arrays, i, edges, mark, stated["sampling_time_s"]) for i in range(count)])
+            if not np.isfinite(times).any():
+                # A SOC that no episode reached has no curve, and so no place in the legend.
+                continue
             handles += lower[0].plot(
-                share, np.sort(np.where(np.isfinite(times), times, np.nan)), color=color, linestyle=":", label=_named(mark)
+                share, np.sort(np.where(np.isfinite(times), times, np.nan)), color=color, linewidth=1.8, label=_named(mark)
             )
             for axis, (name, drawn) in zip(lower[1:], conditions.items(), strict=True):
                 _points(axis, CONDITIONS[name][1] * drawn, times, broken, color)
-        handles += lower[0].plot([], [], "x", color=RED, markersize=3.5, label="violating")
-        upper[0].set_ylabel("worst excess (negative: kept)")
+        if conditions and np.any(broken):
+            handles += lower[0].plot([], [], "x", color=RED, markersize=3.5, label="violating")
+        for unit in units:
+            row_of[unit][0].set_ylabel(f"worst excess ({unit})")
         lower[0].set_ylabel("time (min)")
+        for axis in axes:
+            axis.tick_params(labelbottom=True)
         for axis, label in zip(lower, ("episodes (%)", *(CONDITIONS[name][0] for name in conditions)), strict=True):
             axis.set_xlabel(label)
         letter(axes)
         figure.align_ylabels()
-        legend_above(figure, handles)
+        legend_above(figure, handles, columns=4)
         cell_note(
             figure,
             stated["cell"]["name"],

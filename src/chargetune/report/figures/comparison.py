@@ -42,24 +42,29 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
         figure, axes = new_figure(PAGE_IN, 2.1 * count + 0.5, count, 2, sharex=True)
         for axis in axes[len(names) :]:
             axis.set_axis_off()
-        dashes = iter(DASHES)
+        dashes, limit_line = iter(DASHES), None
         for row in rows:
             if not len(row.episode):
                 continue
             drawn = curves(row.episode)
             own = row.name in COLOURS
-            style: dict[str, Any] = {"color": COLOURS[row.name], "linewidth": 1.3} if own else {"color": GREY, "linewidth": 0.8}
+            style: dict[str, Any] = (
+                {"color": COLOURS[row.name], "linewidth": 2.6 if row.name == "plant oracle" else 1.3}
+                if own
+                else {"color": GREY, "linewidth": 0.8}
+            )
             if not own:
                 style["linestyle"] = next(dashes, "-")
             label = f"{row.name}{' (breaks a limit)' if row.breaks_limit else ''}"
             for name, axis in zip(names, axes, strict=False):
                 signal = "voltage_V" if name == "near" else name
                 if signal in drawn:
-                    axis.plot(*drawn[signal], label=label, zorder=3 if own else 2, **style)
+                    # The oracle is wide and below, for what lies on it is as good.
+                    axis.plot(*drawn[signal], label=label, zorder=1 if row.name == "plant oracle" else 3 if own else 2, **style)
         for name, axis in zip(names, axes, strict=False):
             bound = limits.get(name)
             if bound is not None:
-                axis.axhline(bound, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, zorder=4)
+                limit_line = axis.axhline(bound, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, zorder=4)
             axis.set_ylabel(LABELS[name])
             if name == "near":
                 limit = problem.voltage_max_V
@@ -69,7 +74,11 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
             axis.tick_params(labelbottom=True)
         axes[0].set_xlim(0.0, problem.episode.steps * problem.controller.sampling_time_s / 60)
         letter(axes[: len(names)])
+        for axis in axes[: len(names)]:
+            axis.tick_params(labelbottom=True)
         handles, labels = axes[0].get_legend_handles_labels()
+        if limit_line is not None:
+            handles, labels = [*handles, limit_line], [*labels, "limit"]
         figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.1)
         figure.align_ylabels()
         cell_note(figure, problem.cell.title, problem.cell.remark)

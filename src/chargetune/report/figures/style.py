@@ -85,15 +85,15 @@ def new_figure(width_in: float, height_in: float, rows: int = 1, columns: int = 
 
 def letter(axes: Sequence[Axes]) -> None:
     """(a), (b), ... at the upper left, outside the data."""
-    for axis, name in zip(axes, "abcdefgh", strict=False):
+    for axis, name in zip(axes, "abcdefghijklmnopqrstuvwxyz", strict=False):
         axis.set_title(f"({name})", loc="left", pad=3)
 
 
-def plain_symlog(axis: Axes) -> None:
-    """A y axis for an excess: linear within 1 on either side of the limit, logarithmic beyond, with plain numbers at its ticks."""
+def plain_symlog(axis: Axes, within: float = 1.0) -> None:
+    """A y axis for an excess: linear ``within`` so much on either side of the limit, logarithmic beyond, with plain numbers."""
     from matplotlib.ticker import StrMethodFormatter
 
-    axis.set_yscale("symlog", linthresh=1.0, linscale=0.5)
+    axis.set_yscale("symlog", linthresh=within, linscale=0.5)
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
 
 

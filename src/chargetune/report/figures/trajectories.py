@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.wording import objective_words
 from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
 from chargetune.report.figures.style import (
     BLUE,
     GREY,
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["LABELS", "curves", "panel_names", "trajectories_figure"]
+__all__ = ["LABELS", "curves", "episode_figure", "panel_names", "trajectories_figure"]
 
 LABELS = {
     "soc": "SOC (%)",
@@ -93,7 +95,7 @@ def trajectories_figure(view: StudyView) -> Figure:
         if grey:
             handles.append(Line2D([], [], color=GREY, linewidth=0.8, label="trials"))
         shown, tuned = [], view.tuned
-        for label, trial, color in (("untuned", view.untuned, BLUE), (view.tuned_label, tuned, ORANGE)):
+        for label, trial, color in ((view.start_label, view.start, BLUE), (view.tuned_label, tuned, ORANGE)):
             episode = view.episode(trial)
             if trial is None or episode is None:
                 continue
@@ -112,6 +114,36 @@ def trajectories_figure(view: StudyView) -> Figure:
         letter(axes[: len(names)])
         legend_above(figure, handles)
         cell_note(figure, problem.cell.title, view.remark)
+    return figure
+
+
+def episode_figure(problem: ChargingProblem, episode: Episode, score: Score | None) -> Figure:
+    """The same panels of one charge; the note below says what it was worth."""
+    with journal_style():
+        names = panel_names(problem)
+        rows = (len(names) + 1) // 2
+        figure, axes = new_figure(PAGE_IN, 2.2 * rows, rows, 2, sharex=True)
+        panels = dict(zip(names, axes, strict=False))
+        for axis in axes[len(names) :]:
+            axis.set_axis_off()
+        drawn = curves(episode)
+        for name, axis in panels.items():
+            signal = "voltage_V" if name == "near" else name
+            if signal in drawn:
+                axis.plot(*drawn[signal], color=BLUE, linewidth=0.7 if name == "near" else 1.2, label="this run", zorder=3)
+        handles = [panels["soc"].lines[-1], _limits(panels, problem)[-1]]
+        _frame(figure, panels, problem, [drawn["voltage_V"][1]])
+        letter(axes[: len(names)])
+        legend_above(figure, handles)
+        parts = [problem.cell.remark] if problem.cell.remark else []
+        if score is not None:
+            words = objective_words(problem)
+            parts.insert(
+                0,
+                f"{words.label}: {words.text(-score.objective)} {words.unit}".rstrip()
+                + f", limits {'kept' if score.feasible else 'broken'}",
+            )
+        cell_note(figure, problem.cell.name, "; ".join(parts))
     return figure
 
 
@@ -135,14 +167,19 @@ def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> list[Line2D]:
 
 def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, voltages: list[NDArray[np.float64]]) -> None:
     limit = problem.voltage_max_V
-    peak = np.nanmax(np.concatenate([[limit], *voltages]))
+    peak = float(np.nanmax(np.concatenate(voltages))) if voltages else limit
     # Wild trials leave this panel: it is there to show the runs before and after tuning.
     margin = max(0.02, 1.25 * (peak - limit))
     panels["near"].set_ylim(limit - 0.8 * margin, limit + margin)
+    if peak < limit - 0.8 * margin:
+        said = f"at most {peak:.3f} V: nothing came near the limit"
+        panels["near"].text(0.5, 0.3, said, transform=panels["near"].transAxes, ha="center", fontsize=7.5, color="0.35")
     for name, axis in panels.items():
         axis.set_ylabel(LABELS[name])
         if name != "near":
             axis.autoscale_view()
+    for axis in panels.values():
+        axis.tick_params(labelbottom=True)
     for axis in list(panels.values())[-2:]:
         axis.set_xlabel("time (min)")
     figure.align_ylabels()

@@ -37,6 +37,8 @@ __all__ = [
 ]  # fmt: skip
 
 SOC = np.linspace(0.0, 1.0, 201)
+# What the tuned curve is held against, in `_thetas`.
+START = "start"
 
 
 def backoff_values(backoff: Backoff, nodes_V: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
@@ -61,8 +63,8 @@ def current_limit_values(problem: ChargingProblem, nodes: ArrayLike, soc: ArrayL
 
 
 def violated_soc(view: StudyView) -> list[tuple[float, float]]:
-    """The SOC ranges in which the untuned run was above the upper voltage limit by more than the tolerance."""
-    episode = view.episode(view.untuned)
+    """The SOC ranges in which the start was above the upper voltage limit by more than the tolerance."""
+    episode = view.episode(view.start)
     if episode is None or view.problem is None or view.problem.voltage_max_V is None:
         return []
     voltage, soc = np.stack(episode.signal("voltage_V")), np.stack(episode.signal("soc"))
@@ -83,9 +85,9 @@ def backoff_figure(view: StudyView) -> Figure:
         nodes = {label: 1e3 * np.array(theta[part]) for label, theta in _thetas(view).items()}
         drawn = {label: backoff_values(problem.theta.backoff, values) for label, values in nodes.items()}
         handles = _grey(axis, [1e3 * backoff_values(problem.theta.backoff, t.theta[part]) for t in view.others])
-        for label, color in (("untuned", BLUE), ("tuned", ORANGE)):
+        for label, color in ((START, BLUE), ("tuned", ORANGE)):
             if label in drawn:
-                text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
+                text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (view.start_label, "-")
                 handles += axis.plot(100 * SOC, drawn[label], color=color, linestyle=dashes, label=text, zorder=3)
                 axis.plot(100 * grid, nodes[label], "o", color=color, markersize=3.5, zorder=4, clip_on=False)
         if not np.ptp(list(drawn.values())):
@@ -115,9 +117,10 @@ def resistance_figure(view: StudyView, of: str) -> Figure:
         plant = problem.plant_cell
         if plant is not None and len(true := getattr(plant, f"{of}_ohm")):
             nodes["plant"] = plant.soc, np.array(true)
-        for label, color, marker in (("plant", GREEN, "s"), ("untuned", BLUE, "o"), ("tuned", ORANGE, "o")):
+        for label, color, marker in (("plant", GREEN, "s"), (START, BLUE, "o"), ("tuned", ORANGE, "o")):
             if label in nodes:
-                text, dashes = (view.tuned_label, view.tuned_dashes) if label == "tuned" else (label, "-")
+                text = {"tuned": view.tuned_label, START: view.start_label}.get(label, label)
+                dashes = view.tuned_dashes if label == "tuned" else "-"
                 own, ohms = nodes[label]
                 values = 1e3 * resistance_values(own, ohms)
                 handles += axis.plot(100 * SOC, values, color=color, linestyle=dashes, label=text, zorder=3)
@@ -142,7 +145,7 @@ def current_limit_figure(view: StudyView) -> Figure:
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
         handles = _grey(axis, [values(t.theta) for t in view.others])
         for label, theta in _thetas(view).items():
-            color, text, dashes = (ORANGE, view.tuned_label, view.tuned_dashes) if label == "tuned" else (BLUE, label, "-")
+            color, text, dashes = (ORANGE, view.tuned_label, view.tuned_dashes) if label == "tuned" else (BLUE, view.start_label, "-")
             handles += axis.plot(100 * SOC, values(theta), color=color, linestyle=dashes, label=text, zorder=3)
         axis.set_ylim(0.0, 1.05 * largest)
         axis.set_ylabel("current limit (A)")
@@ -151,9 +154,10 @@ def current_limit_figure(view: StudyView) -> Figure:
 
 
 def _thetas(view: StudyView) -> dict[str, NDArray[np.float64]]:
-    """theta of the untuned controller, which needs no trial, and of the tuned one."""
-    tuned = view.tuned
-    return {"untuned": view.space.default, **({} if tuned is None else {"tuned": np.array(tuned.theta)})}
+    """theta of the start and of the tuned controller; without any trial the start is the untuned one."""
+    start, tuned = view.start, view.tuned
+    first = view.space.default if start is None else np.array(start.theta)
+    return {START: first, **({} if tuned is None else {"tuned": np.array(tuned.theta)})}
 
 
 def _grey(axis: Axes, rows: list[NDArray[np.float64]]) -> list[Any]:
@@ -170,7 +174,7 @@ def _finish(figure: Figure, axis: Axes, view: StudyView, cell: Cell, handles: li
         handles.append(words("tuned: none"))
     spans = [axis.axvspan(100 * low, 100 * high, color=RED, alpha=0.1, linewidth=0) for low, high in violated_soc(view)]
     if spans:
-        spans[0].set_label("untuned over limit")
+        spans[0].set_label(f"{view.start_label} over limit")
         handles.append(spans[0])
     axis.set_xlim(0.0, 100.0)
     axis.set_xlabel("SOC (%)")

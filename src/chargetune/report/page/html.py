@@ -8,19 +8,29 @@ from collections.abc import Sequence
 from html import escape
 from importlib import resources
 
-__all__ = ["Cell", "packed", "paragraph", "plotly_js", "section", "static", "table"]
+__all__ = ["Cell", "beside", "packed", "paragraph", "plotly_js", "section", "static", "table"]
 
 # A number or text, or a text with the class of its cell.
 Cell = str | float | None | tuple[str, str]
 
 
-def table(headings: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = "") -> str:
-    """A table that scrolls sideways where the screen is narrow. The first column is text; numbers have 5 significant digits."""
-    first = ' class="text"'
-    head = "".join(f'<th scope="col"{"" if i else first}>{escape(h)}</th>' for i, h in enumerate(headings))
+def table(headings: Sequence[str | tuple[str, str]], rows: Sequence[Sequence[Cell]], caption: str = "", kind: str = "") -> str:
+    """A table that scrolls sideways where the screen is narrow. The first column is text; numbers have 5 significant digits.
+
+    A heading may be a pair of its text and the class of its cell. ``kind`` is the class of the table.
+    """
+    pairs = [h if isinstance(h, tuple) else (h, "" if i else "text") for i, h in enumerate(headings)]
+    cells = "".join(f'<th scope="col"{f" class={chr(34)}{c}{chr(34)}" if c else ""}>{escape(h)}</th>' for h, c in pairs)
+    head = f"<thead><tr>{cells}</tr></thead>" if any(h for h, _ in pairs) else ""
     body = "".join(f"<tr>{''.join(_cell(c, first=i == 0) for i, c in enumerate(row))}</tr>" for row in rows)
     title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f'<div class="wide"><table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>\n'
+    opened = f'<table class="{kind}">' if kind else "<table>"
+    return f'<div class="wide">{opened}{title}{head}<tbody>{body}</tbody></table></div>\n'
+
+
+def beside(*parts: str) -> str:
+    """Parts side by side where the screen is wide enough."""
+    return f'<div class="beside">\n{"".join(parts)}</div>\n'
 
 
 def paragraph(text: str, kind: str = "") -> str:

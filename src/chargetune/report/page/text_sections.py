@@ -7,11 +7,14 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
+from chargetune.battery.charging.wording import metric_words
+from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
-from chargetune.report.page.html import Cell, paragraph, section, table
+from chargetune.report.page.html import Cell, beside, paragraph, section, table
 from chargetune.report.page.trial_rows import study_head
 from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
 from chargetune.report.study_view import StudyView
+from chargetune.report.words import limits_of_study, objective_of_study
 from chargetune.study.store.database import store_name
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -34,7 +37,7 @@ def opening(view: StudyView) -> str:
         verdict = paragraph(f"The result, trial {best.number}, did not keep the limits{over}: {view.result.sentence}.", "bad")
     else:
         why = f"Why this one: {view.result.sentence}."
-        verdict = paragraph(f"Result: trial {best.number}, which kept every limit{over}. {_minutes(view)} {why}", "good")
+        verdict = paragraph(f"Result: trial {best.number}, which kept every limit{over}. {_headline(view)} {why}", "good")
     note = '<p id="drawing">The figures are being drawn.</p>\n<noscript><p class="bad">The figures need JavaScript.</p></noscript>\n'
     return f"<header>\n<h1>{escape(view.name)}</h1>\n{paragraph(counts + more + '.', 'faint')}{verdict}{note}</header>\n<main>\n"
 
@@ -47,19 +50,26 @@ def _plants_over(trial: Trial | None) -> str:
     return f" ({drawn['violating_plants']:.0f} of {drawn['plants']:.0f} drawn plants over a limit)"
 
 
-def _minutes(view: StudyView) -> str:
-    def t95(trial: Trial | None) -> float | None:
-        return None if trial is None or trial.score is None else trial.score.metrics.get("t95_min")
-
-    tuned, untuned = t95(view.tuned), t95(view.untuned)
-    if tuned is None:
-        end = None if view.tuned is None or view.tuned.score is None else view.tuned.score.metrics.get("soc_end")
-        ended = "The charges ended at a mean" if view.over_range else "The charge ended at a"
-        return "" if end is None else f"{ended} state of charge of {100 * end:.1f} %."
-    kept = "kept the limits" if view.untuned is not None and view.untuned.feasible else "broke a limit"
-    before = "" if untuned is None else f" Untuned it took {untuned:.2f} min and {kept}."
+def _headline(view: StudyView) -> str:
+    """What the result is worth in the study's own words, beside the start; of a charge without a time as objective also t95."""
+    best, start, words = view.tuned, view.start, objective_of_study(view)
+    if best is None or best.score is None:
+        return ""
     mean = ", the mean of its plants" if view.over_range else ""
-    return f"95 % state of charge after {tuned:.2f} min{mean}.{before}"
+    said = f"{_first_upper(words.label)}: {words.text(loss(view, best))} {words.unit}".rstrip() + mean
+    if start is not None and start.score is not None and start is not best:
+        kept = "kept the limits" if start.feasible else "broke a limit"
+        said += f"; {view.start_label}: {words.text(loss(view, start))} {words.unit}".rstrip() + f", which {kept}"
+    t95 = best.score.metrics.get("t95_min")
+    if not words.unit and t95 is not None:
+        before = None if start is None or start.score is None else start.score.metrics.get("t95_min")
+        aside = "" if before is None or start is best else f" ({view.start_label}: {before:.2f} min)"
+        said += f". 95 % state of charge after {t95:.2f} min{aside}"
+    return said + "."
+
+
+def _first_upper(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def what_was_tuned(view: StudyView) -> str:
@@ -68,8 +78,8 @@ def what_was_tuned(view: StudyView) -> str:
     if problem is not None:
         control, charge = problem.controller, problem.episode
         seed = control.mismatch_seed
-        own = "the plant's own" if problem.plant is None else "those of the cell file's circuit"
-        belief = own if seed is None else f"wrong by the factors of mismatch seed {seed}"
+        own = "the plant's own" if problem.plant is None else "those of the cell file's circuit, which is another model than the plant"
+        belief = own if seed is None else f"those of the cell file, wrong by the factors of mismatch seed {seed}"
         start = "of the range of use" if view.over_range and problem.range and problem.range.soc_start else f"{charge.soc_start:g}"
         facts = [
             ("cell", problem.cell.title),
@@ -88,40 +98,57 @@ def what_was_tuned(view: StudyView) -> str:
             facts.insert(1, ("pack", problem.cell.pack_line))
         if problem.range is not None:
             facts.insert(-1, ("range of use", problem.range.line))
-        parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts]))
+        parts.append(table(("", ""), [(what, (str(value), "long text")) for what, value in facts], kind="facts"))
         if view.remark:
             parts.append(paragraph(f"{problem.cell.title}: {view.remark}", "faint"))
-        rows = [(x["name"], float(x["bound"]), x["unit"], float(x["tolerance"]), x["kind"]) for x in head["limits"]]
-        parts.append(table(("limit", "bound", "unit", "tolerance", "in the controller"), rows))
+        rows = [(x["name"], f"{x['bound']:g} {x['unit']}", _amount(x["name"], x["tolerance"]), x["kind"]) for x in head["limits"]]
+        parts.append(table(("limit", "bound", "tolerance", "in the controller"), rows))
     else:
         parts.append(
             paragraph("The study is not one of battery charging. What an evaluation does is in its configuration, under Provenance.")
         )
+        allowed = [(x["label"], _told(x["tolerance"], x["unit"])) for x in head["excesses"]]
+        parts += [table(("limit", "tolerance"), allowed)] if allowed else []
     return section("What was tuned", *parts)
 
 
+def _amount(name: str, value: float, digits: str = ".3g") -> str:
+    """A difference of a limit's signal: volts in mV, the others in the unit that the limit's name ends with."""
+    factor, unit = (1e3, "mV") if name.endswith("_V") else (1.0, name.rpartition("_")[2])
+    if abs(value) <= 1e-9:
+        value = 0.0  # the rounding of a held input
+    return f"{factor * value:{digits}} {unit}"
+
+
+def _told(value: float | None, unit: str) -> str:
+    return "differs by trial" if value is None else f"{value:.4g} {unit}".rstrip()
+
+
 def result(view: StudyView) -> str:
-    best, untuned = view.tuned, view.untuned
+    best, start = view.tuned, view.start
     if best is None:
         return ""
     rows: list[tuple[Cell, ...]] = []
     for x, value in zip(study_head(view)["theta"], best.theta, strict=True):
         span = x["upper"] - x["lower"]
         at = "at its bound" if min(value - x["lower"], x["upper"] - value) <= 1e-6 * span else ""
-        rows.append((x["entry"], value, x["untuned"], "" if x["unit"] == "1" else x["unit"], x["lower"], x["upper"], at))
-    headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower bound", "upper bound", "")
-    names = dict.fromkeys(name for t in (untuned, best) if t is not None and t.score is not None for name in t.score.metrics)
-    figures = [
-        (name, *(t.score.metrics.get(name) if t is not None and t.score is not None else None for t in (untuned, best))) for name in names
-    ]
+        rows.append((x["entry"], value, x["untuned"], x["unit"], x["lower"], x["upper"], at))
+    headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower", "upper", "")
+    scores = [t.score if t is not None else None for t in (start, best)]
+    names = dict.fromkeys(name for score in scores if score is not None for name in score.metrics)
+    figures: list[tuple[Cell, ...]] = []
+    for name in names:
+        label, unit = metric_words(name)
+        figures.append((label, *(None if score is None else score.metrics.get(name) for score in scores), (unit, "text")))
     what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
-    return section(what, table(headings, rows), table(("figure of merit", "untuned", f"trial {best.number}"), figures))
+    merit = table(("figure of merit", view.start_label, f"trial {best.number}", ("unit", "text")), figures)
+    return section(what, beside(table(headings, rows), merit))
 
 
 def limits(view: StudyView) -> str:
     title, judged = "Limits, checked again from the stored traces", view.judged
     if judged is None:
-        stored = [(name, e, t) for name, e, t in _stored(view.tuned)]
+        stored = _stored(view)
         text = "What the limits mean is not in the study's document, so they cannot be judged again. The stored excess of the result:"
         return section(title, paragraph(text), table(("limit", "excess", "tolerance"), stored))
     checks, damaged = {}, []
@@ -132,7 +159,7 @@ def limits(view: StudyView) -> str:
             score = None if view.over_range else reading.trial.score
             checks[reading.trial.number] = recheck(judged, reading.episode, score)
     parts = []
-    for label, trial in (("untuned", view.untuned), (view.tuned_label, view.tuned)):
+    for label, trial in ((view.start_label, view.start), (view.tuned_label, view.tuned)):
         if trial is not None and trial.number in checks:
             parts.append(_check_table(f"{label}, trial {trial.number}", checks[trial.number]))
     wrong = [number for number, found in checks.items() if not all(c.agrees for c in found)]
@@ -147,20 +174,25 @@ def limits(view: StudyView) -> str:
     return section(title, *parts)
 
 
-def _stored(trial: Trial | None) -> list[tuple[str, float, float]]:
-    score = None if trial is None else trial.score
-    return [] if score is None else [(name, value, score.tolerance.get(name, 0.0)) for name, value in score.excess.items()]
+def _stored(view: StudyView) -> list[tuple[Cell, ...]]:
+    score = None if view.tuned is None else view.tuned.score
+    out: list[tuple[Cell, ...]] = []
+    for limit in limits_of_study(view) if score is not None else []:
+        excess = f"{limit.factor * score.excess[limit.name]:.4g} {limit.unit}".rstrip() if score and limit.name in score.excess else None
+        out.append((limit.label, excess, _told(limit.tolerance, limit.unit)))
+    return out
 
 
 def _check_table(caption: str, checks: Sequence[LimitCheck]) -> str:
     rows: list[tuple[Cell, ...]] = [
         (
-            c.name, c.bound, c.reached, c.at_s / 60, c.excess, c.tolerance, c.judged, c.true_excess,
+            c.name, f"{c.bound:g} {c.name.rpartition('_')[2]}", f"{c.reached:.5g}", f"{c.at_s / 60:.2f}", _amount(c.name, c.excess, ".4g"),
+            _amount(c.name, c.tolerance), c.judged, None if c.true_excess is None else _amount(c.name, c.true_excess, ".4g"),
             ("kept", "good") if c.kept else ("broken", "bad"),
         )
         for c in checks
     ]  # fmt: skip
-    headings = ("limit", "bound", "reached", "at min", "excess", "tolerance", "judged on", "excess without noise", "")
+    headings = ("limit", "bound", "reached", "at (min)", "excess", "tolerance", "judged on", "without noise", "")
     return table(headings, rows, caption)
 
 
@@ -169,12 +201,13 @@ def violations(view: StudyView) -> str:
     title = "Violations during tuning"
     if not broke:
         return section(title, paragraph("No trial went beyond a limit by more than its tolerance."))
-    names = list(dict.fromkeys(n for t in broke if t.score is not None for n in t.score.excess))
     rows: list[tuple[Cell, ...]] = []
-    for name in names:
-        over = [(t.score.excess[name], t.number) for t in broke if t.score is not None and _over(t, name)]
+    for limit in limits_of_study(view):
+        over = [(limit.factor * t.score.excess[limit.name], t.number) for t in broke if t.score is not None and _over(t, limit.name)]
         if over:
-            rows.append((name, len(over), *max(over), min(n for _, n in over), max(n for _, n in over)))
+            worst, number = max(over)
+            said = f"{worst:.4g} {limit.unit}".rstrip()
+            rows.append((limit.label, len(over), said, number, min(n for _, n in over), max(n for _, n in over)))
     return section(
         title,
         paragraph(f"{len(broke)} of {len(view.trials)} trials went beyond a limit by more than its tolerance."),
@@ -237,8 +270,8 @@ def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
     others = {json.dumps(t.provenance.get("versions"), sort_keys=True) for t in view.trials}
     if len(others) > 1:
         rows.append(("further versions", f"the trials were made with {len(others)} different sets of programs"))
-    parts = [table(("", ""), [(a, (str(b), "long text")) for a, b in rows])]
+    parts = [table(("", ""), [(a, (str(b), "long text")) for a, b in rows], kind="facts")]
     if record is not None:
         text = escape(json.dumps(record.identity, indent=1, ensure_ascii=False))
         parts.append(f"<details>\n<summary>The whole configuration</summary>\n<pre>{text}</pre>\n</details>\n")
-    return section("Provenance", *parts) + "</main>\n"
+    return section("Provenance", *parts)

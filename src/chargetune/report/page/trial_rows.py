@@ -10,20 +10,28 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from chargetune.battery.charging.wording import metric_words
 from chargetune.episode.episode import Episode
-from chargetune.report.figures.convergence import excess_unit, loss, loss_label, worst_excess
+from chargetune.report.best_possible import best_possible
+from chargetune.report.figures.convergence import drawn_limits, linear_within, loss
 from chargetune.report.study_view import StudyView
+from chargetune.report.words import limits_of_study, objective_of_study
 from chargetune.study.trial import Trial, TrialStatus
 
-__all__ = ["study_head", "study_summary", "theta_document", "trace_csv", "trial_rows"]
+__all__ = ["objective_text", "study_head", "study_summary", "theta_document", "trace_csv", "trial_rows"]
 
 
 def study_head(view: StudyView) -> dict[str, Any]:
-    """What does not change from trial to trial: names, limits, the entries of theta with unit and bounds, tuner, provenance."""
+    """What does not change from trial to trial: names, limits, the entries of theta with unit and bounds, tuner, provenance.
+
+    ``objective`` says what the ``value`` of a row is, ``excesses`` what its excesses are, each in its unit and with its tolerance.
+    """
     record, problem, space = view.record, view.problem, view.space
-    unit, scale = excess_unit(view)
-    allowed = {v for t in view.trials if t.score is not None for v in t.score.tolerance.values()}
+    words, drawn = objective_of_study(view), {limit.name for limit in drawn_limits(view)}
+    possible = best_possible(view)
     units = [p.unit for p in space.parameters for _ in range(p.size)]
+    scales = [p.scale for p in space.parameters for _ in range(p.size)]
+    names = dict.fromkeys(name for t in view.trials if t.score is not None for name in t.score.metrics)
     return {
         "id": None if record is None else record.id,
         "name": view.name,
@@ -31,13 +39,37 @@ def study_head(view: StudyView) -> dict[str, Any]:
         "tuner": view.tuner,
         "cell": "" if problem is None else problem.cell.title,
         "remark": view.remark,
-        "loss_label": loss_label(view),
-        "excess_unit": unit,
-        "tolerance": scale * allowed.pop() if len(allowed) == 1 and unit in ("mV", "unit of the limit") else None,
+        "objective": {
+            "label": words.axis,
+            "short": f"{words.short} ({words.unit})" if words.unit else words.short,
+            "most": words.most,
+            "larger": words.factor < 0,
+            "possible": None if possible is None else _finite(words.factor * possible),
+        },
+        "excesses": [
+            {
+                "name": limit.name,
+                "label": limit.label,
+                "unit": limit.unit,
+                "tolerance": limit.tolerance,
+                "judged": limit.judged if limit.samples > 1 else "",
+                "drawn": limit.name in drawn,
+                "within": linear_within(view, limit),
+            }
+            for limit in limits_of_study(view)
+        ],
+        "metrics": {name: list(metric_words(name)) for name in names},
         "limits": limits_of(view),
         "theta": [
-            {"entry": entry, "unit": u, "lower": float(low), "upper": float(high), "untuned": float(start)}
-            for entry, u, low, high, start in zip(space.entries, units, space.lower, space.upper, space.default, strict=True)
+            {
+                "entry": entry,
+                "unit": "" if u == "1" else u,
+                "lower": float(low),
+                "upper": float(high),
+                "untuned": float(start),
+                "scale": scale,
+            }
+            for entry, u, low, high, start, scale in zip(space.entries, units, space.lower, space.upper, space.default, scales, strict=True)
         ],
     }
 
@@ -58,11 +90,11 @@ def limits_of(view: StudyView) -> list[dict[str, Any]]:
 
 
 def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """One row a trial. ``loss`` is what the tuner makes small, ``excess`` the worst over all limits in the unit of the head.
+    """One row a trial. ``value`` is what it was worth and ``excesses`` are its excesses, in the words and units of the head.
 
     Both are None without a score. ``counted``: it may be the incumbent, being within the limits, or for the tuner "ei" scored.
     """
-    _, scale = excess_unit(view)
+    words, limits = objective_of_study(view), limits_of_study(view)
     return [
         {
             "number": trial.number,
@@ -70,15 +102,27 @@ def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]
             "ending": trial.ending or "",
             "feasible": None if trial.score is None else trial.feasible,
             "counted": trial.score is not None and (view.tuner == "ei" or trial.feasible),
-            "loss": _finite(loss(view, trial)),
-            "excess": _finite(scale * worst_excess(view, trial.score)),
+            "value": _finite(words.factor * loss(view, trial)),
+            "excesses": {
+                limit.name: None if trial.score is None else _finite(limit.factor * trial.score.excess.get(limit.name, math.nan))
+                for limit in limits
+            },
             "metrics": {} if trial.score is None else {name: _finite(v) for name, v in trial.score.metrics.items()},
+            "theta": [_finite(v) for v in trial.theta],
             "asked_at": trial.asked_at,
             "told_at": trial.told_at or "",
             "trace": trial.trace_sha256 is not None,
         }
         for trial in trials
     ]
+
+
+def objective_text(view: StudyView, trial: Trial | None) -> str:
+    """What a trial was worth, in the words of its study: "t80 24.33 min"; empty without a score."""
+    if trial is None or trial.score is None:
+        return ""
+    words = objective_of_study(view)
+    return f"{words.short} {words.text(loss(view, trial))} {words.unit}".rstrip()
 
 
 def study_summary(view: StudyView) -> dict[str, Any]:
@@ -95,7 +139,7 @@ def study_summary(view: StudyView) -> dict[str, Any]:
         "violating": sum(t.score is not None and not t.score.feasible for t in view.trials),
         "best": None if best is None or not best.feasible else best.number,
         "result": view.result.facts(),
-        "best_t95_min": None if best is None or best.score is None or not best.feasible else best.score.metrics.get("t95_min"),
+        "best_objective": objective_text(view, best) if best is not None and best.feasible else "",
         "told_at": max((t.told_at or "" for t in view.trials), default=""),
     }
 

@@ -13,10 +13,9 @@ function line(study) {
   const row = document.createElement("tr"), link = document.createElement("a");
   link.href = `/studies/${study.id}`;
   link.textContent = study.name;
-  const t95 = study.best_t95_min === null || study.best_t95_min === undefined ? "-" : study.best_t95_min.toFixed(2);
   row.append(
     cell(link, "text"), cell(String(study.done)), cell(String(study.running)), cell(String(study.failed)), cell(String(study.violating)),
-    cell(study.best === null ? "-" : String(study.best)), cell(t95), cell(study.tuner || "-", "text"),
+    cell(study.best === null ? "-" : String(study.best)), cell(study.best_objective || "-", "text"), cell(study.tuner || "-", "text"),
     cell(study.told_at ? study.told_at.slice(0, 19).replace("T", " ") : "-", "text"),
   );
   return row;

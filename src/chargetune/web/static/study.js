@@ -2,121 +2,21 @@
 // One study, live. The server tells what is new; everything is drawn from what it told. Text goes in as text, never as markup.
 const BASE = location.pathname.replace(/\/$/, "");
 const where = (id) => document.getElementById(id);
-const rows = new Map(), lines = new Map(), drawings = new Map(), places = new Map();
-// A browser takes seconds over a table of thousands of lines: more are added when one scrolls to the end.
-const MORE = 100;
-const sorting = { key: "number", down: true, count: MORE };
-let head = null, result = null, untuned = null, tuned = null, tunedLabel = "tuned", chosen = fromAddress();
-let columns = [];
-
-const FIXED = [
-  { key: "number", title: "trial", value: (row) => row.number },
-  { key: "status", title: "status", text: true, value: (row) => row.status },
-  { key: "limits", title: "limits", text: true, value: (row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken") },
-  { key: "loss", title: "loss", value: (row) => row.loss },
-  { key: "excess", title: "worst excess", value: (row) => row.excess },
-];
-const LAST = [{ key: "ending", title: "ending", text: true, value: (row) => row.ending }];
-
-const short = (value) => (typeof value === "number" ? (Number.isInteger(value) ? String(value) : value.toPrecision(4)) : value || "-");
+const rows = new Map(), drawings = new Map(), places = new Map();
+let head = null, result = null, start = null, startLabel = "untuned", tuned = null, tunedLabel = "tuned", chosen = fromAddress();
+const table = Trials(where, rows, choose);
+const sliceOver = Slices(where, () => draw());
 
 function fromAddress() {
   return location.hash.slice(1).split(",").filter((part) => /^\d{1,9}$/.test(part)).map(Number).slice(0, 2);
 }
 
-// The table
-
-function findColumns() {
-  const names = new Set(columns.filter(({ metric }) => metric).map(({ key }) => key));
-  const before = names.size;
-  for (const row of rows.values()) for (const name of Object.keys(row.metrics)) names.add(name);
-  if (columns.length && names.size === before) return;
-  const metrics = [...names].map((name) => ({ key: name, title: name, metric: true, value: (row) => row.metrics[name] ?? null }));
-  columns = [...FIXED, ...metrics, ...LAST];
-  lines.clear();
-  where("headings").replaceChildren(...columns.map((column) => {
-    const heading = document.createElement("th"), button = document.createElement("button");
-    heading.scope = "col";
-    heading.className = column.text ? "text" : "";
-    heading.dataset.key = column.key;
-    button.type = "button";
-    button.textContent = column.title;
-    button.addEventListener("click", () => {
-      sorting.down = sorting.key === column.key ? !sorting.down : false;
-      sorting.key = column.key;
-      sorting.count = MORE;
-      where("table").scrollTop = 0;
-      showTable();
-    });
-    heading.append(button);
-    return heading;
-  }));
-}
-
-function tableLine(row) {
-  const line = document.createElement("tr");
-  line.dataset.number = row.number;
-  for (const column of columns) {
-    const node = document.createElement("td"), value = column.value(row);
-    node.className = column.text ? "text" : "";
-    if (value === "broken" || value === "failed") node.classList.add("bad");
-    if (column.key === "number") {
-      const button = document.createElement("button");
-      button.type = "button";
-      button.textContent = String(value);
-      node.append(button);
-    } else node.textContent = short(value);
-    line.append(node);
-  }
-  return line;
-}
-
-function showTable() {
-  findColumns();
-  const value = columns.find(({ key }) => key === sorting.key).value, sign = sorting.down ? -1 : 1;
-  const none = (v) => v === null || v === "" || v === undefined;
-  // What has no value stays below, whichever way.
-  const sorted = [...rows.values()].sort((a, b) => {
-    const x = value(a), y = value(b);
-    if (none(x) || none(y)) return none(x) - none(y) || a.number - b.number;
-    return (x < y ? -1 : x > y ? 1 : 0) * sign || a.number - b.number;
-  });
-  where("rows").replaceChildren(...sorted.slice(0, sorting.count).map((row) => {
-    if (!lines.has(row.number)) lines.set(row.number, tableLine(row));
-    return lines.get(row.number);
-  }));
-  for (const heading of where("headings").children) {
-    heading.ariaSort = heading.dataset.key === sorting.key ? (sorting.down ? "descending" : "ascending") : "none";
-  }
-  markLines();
-}
-
-function markLines() {
-  for (const [number, line] of lines) {
-    line.classList.toggle("chosen", chosen.includes(number));
-    line.classList.toggle("best", number === tuned);
-  }
-}
-
 function choose(number) {
   chosen = chosen.includes(number) ? chosen.filter((other) => other !== number) : [...chosen, number].slice(-2);
   history.replaceState(null, "", chosen.length ? `#${chosen.join(",")}` : location.pathname);
-  markLines();
+  table.choose(chosen);
   draw();
 }
-
-where("rows").addEventListener("click", (event) => {
-  const line = event.target.closest("tr");
-  if (line) choose(Number(line.dataset.number));
-});
-
-where("table").addEventListener("scroll", () => {
-  const { scrollTop, clientHeight, scrollHeight } = where("table");
-  if (scrollTop + 2 * clientHeight > scrollHeight && sorting.count < rows.size) {
-    sorting.count += MORE;
-    showTable();
-  }
-});
 
 // The figures
 
@@ -143,8 +43,8 @@ function newest() {
 
 function wanted() {
   const list = [{ label: `newest (trial ${newest()})`, colour: "trials", number: newest() }];
-  list.push({ label: `untuned (trial ${untuned})`, colour: "untuned", number: untuned });
-  list.push({ label: `${tunedLabel} (trial ${tuned})`, colour: "tuned", number: tuned, dash: tuned === untuned ? "dash" : "" });
+  list.push({ label: `${startLabel} (trial ${start})`, colour: "untuned", number: start });
+  list.push({ label: `${tunedLabel} (trial ${tuned})`, colour: "tuned", number: tuned, dash: tuned === start ? "dash" : "" });
   const [one, other] = chosen;
   list.push({ label: `trial ${one}`, colour: "one", number: one ?? null, dash: "dot" });
   list.push({ label: `trial ${other}`, colour: "other", number: other ?? null, dash: "dot" });
@@ -212,6 +112,9 @@ async function drawOnce() {
     all.dataset.listens = "yes";
     all.on("plotly_click", ({ points }) => choose(points[0].x));
   }
+  const theta = place("parallel", "all", "theta of every trial (parallel coordinates)", true), slices = place("slices", "one", "each trial over one entry of theta");
+  await Figures.parallel(theta, head, list, marked);
+  await Figures.slice(slices, head, list, sliceOver(head, list), marked);
   where("message").textContent = shown.filter(({ number, drawing: found }) => found.message && chosen.includes(number))
     .map(({ number, drawing: found }) => `Trial ${number}: ${found.message}.`).join(" ");
   compare(shown);
@@ -255,11 +158,12 @@ function compare(shown) {
     body.push(line);
   };
   const both = picked.map(({ number }) => rows.get(number));
-  for (const column of [...FIXED.slice(1), ...columns.filter(({ metric }) => metric)]) {
-    const unit = column.key === "excess" ? ` (${head.excess_unit})` : "";
-    add(`${column.title}${unit}`, both.map((row) => column.value(row)));
-  }
-  for (const { entry, unit } of head.theta) add(unit === "1" ? entry : `${entry} (${unit})`, picked.map(({ drawing: found }) => found.theta[entry]));
+  add("status", both.map((row) => row.status));
+  add("limits", both.map((row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken")));
+  add(head.objective.label, both.map((row) => row.value));
+  for (const { name, label, unit } of head.excesses) add(named(label, unit), both.map((row) => row.excesses[name] ?? null));
+  for (const [name, [label, unit]] of Object.entries(head.metrics)) add(named(label, unit), both.map((row) => row.metrics[name] ?? null));
+  for (const { entry, unit } of head.theta) add(named(entry, unit), picked.map(({ drawing: found }) => found.theta[entry]));
   where("compared-rows").replaceChildren(...body);
 }
 
@@ -286,7 +190,7 @@ function about() {
 source.addEventListener("study", (event) => {
   head = JSON.parse(event.data);
   rows.clear();
-  lines.clear();
+  table.head(head);
   document.title = `chargetune: ${head.name}`;
   where("name").textContent = head.name;
   about();
@@ -295,12 +199,14 @@ source.addEventListener("trials", (event) => {
   const news = JSON.parse(event.data);
   for (const row of news.rows) {
     rows.set(row.number, row);
-    lines.delete(row.number);
+    table.changed(row.number);
   }
-  ({ untuned, tuned, tuned_label: tunedLabel, result } = news);
+  ({ start, start_label: startLabel, tuned, tuned_label: tunedLabel, result } = news);
+  table.results({ best: tuned, start, startLabel });
   about();
   tell();
-  showTable();
+  table.show();
+  table.choose(chosen);
   state("live", "good");
   draw();
 });
@@ -313,6 +219,6 @@ source.onerror = () => {
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => head && draw());
 window.addEventListener("hashchange", () => {
   chosen = fromAddress();
-  markLines();
+  table.choose(chosen);
   draw();
 });
