@@ -191,6 +191,16 @@ def test_reproduce_writes_claims_rows_and_figures(tmp_path):
     assert len(list(tmp_path.rglob("*.png"))) >= 4
 
 
+def test_reproduce_of_a_learnt_stage_cost(tmp_path):
+    done = chargetune("reproduce", "rbf", "--seeds", "1", "--trials", 1, "--workers", 1, "--out", tmp_path)
+    assert "cautious cost" in done.stdout
+    result = json.loads((tmp_path / "claims.json").read_text())
+    (row,) = result["per_seed"]
+    assert abs(row["untuned"]["overshoot_mV"] - 62.5) < 1
+    assert row["safe_twin"]["overshoot_mV"] < 0
+    assert [way["name"] for way in result["summary"]["ways"]][1:3] == ["offset-free", "cautious cost"]
+
+
 @pytest.mark.parametrize("seeds", ["3:3", "a:b", "-1:2", "1,1"])
 def test_bad_seeds_are_refused(seeds, tmp_path, refused):
     assert "--seeds" in refused("reproduce", "model", f"--seeds={seeds}", "--out", tmp_path / "o")

@@ -43,6 +43,7 @@ class CaseName(StrEnum):
     BACKOFF = "backoff"
     MODEL = "model"
     BOTH = "both"
+    RBF = "rbf"
 
 
 class TunerChoice(StrEnum):
@@ -181,12 +182,17 @@ def simulate(
 def show(
     store: StoreArgument,
     study: Annotated[str | None, typer.Option(help="Name of a study; by default all are listed.")] = None,
+    worth: Annotated[bool, typer.Option("--worth", help="What each entry of theta is worth over the range of use of that study.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """List the studies of a store, or the trials of one."""
     from chargetune.cli.show import show_command
+    from chargetune.cli.worth import show_worth
 
-    show_command(store, study=study, as_json=as_json)
+    if worth:
+        show_worth(store, study=study, as_json=as_json)
+    else:
+        show_command(store, study=study, as_json=as_json)
 
 
 @app.command()
@@ -227,7 +233,9 @@ def web(
 
 @app.command()
 def reproduce(
-    case: Annotated[CaseName, typer.Argument(help="What theta is: the backoff, the model's R1, or both.", show_default=False)],
+    case: Annotated[
+        CaseName, typer.Argument(help="What theta is: the backoff, the model's R1, both, or the stage cost (rbf).", show_default=False)
+    ],
     seeds: Annotated[str, typer.Option(help="Mismatch seeds A:B (B not included), or a list A,B,C.")] = "0:20",
     trials: Annotated[int, typer.Option(min=1, help="Trials of each seed.")] = 60,
     tuner: Annotated[
@@ -240,7 +248,7 @@ def reproduce(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat a study of Hirt et al. (ADCHEM 2024) over mismatch seeds and decide its claims."""
+    """Repeat a study of Hirt et al. (ADCHEM 2024, rbf: arXiv 2410.04982) over mismatch seeds and decide its claims."""
     from chargetune.cli.reproduce import reproduce_command
 
     reproduce_command(

@@ -77,11 +77,13 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
         print(json.dumps(result))  # noqa: T201
         return
     screen = console()
-    screen.print(_rows_table(rows))
     summary = result["summary"]
+    screen.print(_ways_table(summary["ways"]) if case == "rbf" else _rows_table(rows))
     screen.print(
         "offset-free: the untuned controller that reads the voltage, in its first charge; the others do not read it", soft_wrap=True
     )
+    if case == "rbf":
+        screen.print("cautious cost: what the safe twin begins with; oracle: the untuned controller that knows the cell", soft_wrap=True)
     screen.print(f"\n{summary['safe']} of {summary['of']} seeds within 1 mV, median t95 {number(summary['t95_min_median'])} min, "
                  f"{summary['violating_trials']} of {summary['all_trials']} trials violated")  # fmt: skip
     table = Table(box=None, pad_edge=False, title="Claims", title_justify="left")
@@ -129,5 +131,18 @@ def _rows_table(rows: list[dict[str, Any]]) -> Table:
             number(feedback["overshoot_mV"], 1), number(feedback["t95_min"]), number(tuned.get("overshoot_mV"), 2),
             number(tuned.get("t80_min")), number(tuned.get("t95_min")), number(row["attainable_t95_min"], 1),
             f"{row['violating_trials']}/{row['trials']}", number(row["worst_excess_mV"], 1),
+        )  # fmt: skip
+    return table
+
+
+def _ways_table(ways: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "within 1 mV", "worst mV", "median t80", "median t95", "trials over"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for way in ways:
+        trials = "-" if way["trials"] is None else f"{way['violating_trials']} of {way['trials']}"
+        table.add_row(
+            way["name"], f"{way['safe']} of {way['of']}", number(way["worst_mV"], 1),
+            number(way["t80_min_median"]), number(way["t95_min_median"]), trials,
         )  # fmt: skip
     return table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,8 @@ class Parameter:
     """One named entry of theta, a scalar (``size=1``) or a vector of spline nodes.
 
     ``default`` is the untuned value theta_0, one number for all entries or one an entry.
-    ``scale="log"`` means that the logarithm is what the tuner sees as uniform.
+    ``scale="log"`` means that the logarithm is what the tuner sees as uniform. ``shape`` is that of the table whose entries these are,
+    the last index fastest; by default they are neighbours in a row.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Parameter:
     unit: str = "1"
     scale: Scale = "linear"
     size: int = 1
+    shape: tuple[int, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "[], \t\n"):
@@ -40,10 +42,14 @@ class Parameter:
             raise ValueError(f"parameter {self.name}: size = {self.size!r}, allowed is an integer >= 1")
         if self.scale not in ("linear", "log"):
             raise ValueError(f"parameter {self.name}: scale = {self.scale!r}, allowed is 'linear' or 'log'")
-        for field in ("lower", "upper"):
-            value = getattr(self, field)
+        shape = tuple(self.shape) or (self.size,)
+        if math.prod(shape) != self.size:
+            raise ValueError(f"parameter {self.name}: shape = {shape}, allowed is one of size = {self.size} entries")
+        object.__setattr__(self, "shape", shape)
+        for bound in ("lower", "upper"):
+            value = getattr(self, bound)
             if not is_finite(value):
-                raise ValueError(f"parameter {self.name}: {field} = {value!r}, allowed is a finite number")
+                raise ValueError(f"parameter {self.name}: {bound} = {value!r}, allowed is a finite number")
         if self.lower >= self.upper:
             raise ValueError(f"parameter {self.name}: lower = {self.lower:g} must be less than upper = {self.upper:g}")
         if self.scale == "log" and self.lower <= 0:
@@ -56,8 +62,8 @@ class Parameter:
                 raise ValueError(f"parameter {self.name}: default = {value!r}, allowed is [{self.lower:g}, {self.upper:g}] {self.unit}")
         object.__setattr__(self, "default", tuple(float(v) for v in values))
         # NumPy's numbers become Python's, which JSON knows.
-        for field, kind in (("lower", float), ("upper", float), ("size", int)):
-            object.__setattr__(self, field, kind(getattr(self, field)))
+        for name, kind in (("lower", float), ("upper", float), ("size", int)):
+            object.__setattr__(self, name, kind(getattr(self, name)))
 
     @property
     def entries(self) -> tuple[str, ...]:

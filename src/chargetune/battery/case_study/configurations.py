@@ -1,22 +1,24 @@
-"""The studies of the paper."""
+"""The studies of the papers."""
 
 from __future__ import annotations
 
+from chargetune.battery.charging.radial_basis import RadialBasis
 from chargetune.battery.charging.settings import ControllerSettings
 from chargetune.battery.charging.tunables import Backoff, ResistanceRatio, Tunables
 from chargetune.battery.studies.study_file import Config, StudyTable, TunerName
 
-__all__ = ["case_study"]
+__all__ = ["CASE_STUDIES", "case_study"]
 
 CASE_STUDIES: dict[str, Tunables] = {
     "backoff": Tunables(backoff=Backoff(lower_V=0.0, upper_V=0.2)),
     "model": Tunables(R1=ResistanceRatio()),
     "both": Tunables(backoff=Backoff(lower_V=0.0, upper_V=0.2), R1=ResistanceRatio()),
+    "rbf": Tunables(rbf=RadialBasis()),
 }
 
 
 def case_study(name: str, mismatch_seed: int, tuner: TunerName = "default", seed: int | None = None) -> Config:
-    """A study of the paper: theta is the backoff, the model's R1, or both. The tuner's seed is the mismatch seed's."""
+    """A study of the papers: theta is backoff, R1, both, or a radial-basis stage cost. The tuner's seed is the mismatch seed's."""
     if name not in CASE_STUDIES:
         raise ValueError(f"case study {name!r}, allowed are {', '.join(CASE_STUDIES)}")
     return Config(

@@ -11,10 +11,11 @@ import numpy as np
 
 from chargetune.battery.case_study.claims import SeedRun, decide
 from chargetune.battery.case_study.configurations import CASE_STUDIES, case_study
+from chargetune.battery.case_study.radial_basis import SAFE_TRIALS, by_way, decide_claims, oracle, safe_study
 from chargetune.battery.charging.evaluate import Evaluation, evaluate
 from chargetune.battery.charging.problem import ChargingProblem, with_feedback
 from chargetune.battery.studies.open_study import open_study
-from chargetune.battery.studies.study_file import TunerName, problem_of_document
+from chargetune.battery.studies.study_file import Config, TunerName, problem_of_document
 from chargetune.episode.episode import Episode
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.result import read_result
@@ -64,10 +65,30 @@ def reproduce(
 
 def _run_seed(case: str, seed: int, trials: int, tuner: TunerName, path: Path) -> dict[str, Any]:
     config = case_study(case, seed, tuner)
+    _run(path, config, trials)
+    if case == "rbf":
+        _run(path, safe_study(seed), min(trials, SAFE_TRIALS))
+    with Store(path, read_only=True) as store:
+        row = seed_row(case, seed, seed_run(store, config.study.name, trials))
+        return row | _safe_twin(store, seed) if case == "rbf" else row
+
+
+def _run(path: Path, config: Config, trials: int) -> None:
     with Store(path, busy_timeout_s=60.0) as store, open_study(store, config) as study:
         study.run(Evaluation(config.problem()), trials)
-    with Store(path, read_only=True) as store:
-        return seed_row(case, seed, seed_run(store, config.study.name, trials))
+
+
+def _safe_twin(store: Store, seed: int) -> dict[str, Any]:
+    """The part of a row that stands beside a learnt stage cost: the cautious cost, the safe twin's, the controller that knows the cell."""
+    run = seed_run(store, safe_study(seed).study.name)
+    known = oracle(run.problem)
+    return {
+        "cautious": {name: run.metric(name, tuned=False) for name in FIGURES},
+        "safe_twin": None if run.tuned is None else {name: run.metric(name, tuned=True) for name in FIGURES},
+        "safe_twin_trials": len(run.trials),
+        "safe_twin_violating": run.violating,
+        "oracle": {name: known.get(name) for name in FIGURES},
+    }
 
 
 def seed_run(store: Store, name: str, trials: int | None = None) -> SeedRun:
@@ -143,7 +164,7 @@ def _studies(folder: Path, tuner: TunerName, seeds: Sequence[int]) -> Iterator[d
 def summarise(folder: Path, case: str, tuner: TunerName, rows: list[dict[str, Any]], trials: int) -> dict[str, Any]:
     """The content of claims.json: claims over all studies of this tuner in the folder, rows of the one that was run."""
     seeds = [row["seed"] for row in rows]
-    claims = decide(list(_studies(folder, tuner, seeds)))
+    claims = decide_claims(rows) if case == "rbf" else decide(list(_studies(folder, tuner, seeds)))
     tuned = [row["tuned"] for row in rows]
     t95 = [t["t95_min"] if t and t["t95_min"] is not None else np.inf for t in tuned]
     ratios = [t / row["attainable_t95_min"] for t, row in zip(t95, rows, strict=True) if row["attainable_t95_min"]]
@@ -162,6 +183,7 @@ def summarise(folder: Path, case: str, tuner: TunerName, rows: list[dict[str, An
             "t95_to_attainable_median": _finite(np.median(ratios)) if ratios else None,
             "violating_trials": sum(row["violating_trials"] for row in rows),
             "all_trials": sum(row["trials"] for row in rows),
+            **({"ways": by_way(rows, tuner)} if case == "rbf" else {}),
         },
         "per_seed": rows,
     }

@@ -163,7 +163,7 @@ def write_certificate(
         "confidence": confidence,
         "range": {} if problem.range is None else problem.range.entries,
         "meaning": MEANING,
-        "drawn": DRAWN if problem.plant_cell else f"{DRAWN} {DRAWN_ELECTROCHEMICAL}",
+        "drawn": drawn_text(problem),
         "judged": "true outputs, without sensor noise, at both ends of every interval",
         "limits": [
             {"name": limit.name, "signal": limit.signal, "upper": limit.upper, "bound": limit.bound, "tolerance": limit.tolerance}
@@ -180,6 +180,14 @@ def write_certificate(
     if old is not None and old != traces:
         old.unlink(missing_ok=True)
     return certificate
+
+
+def drawn_text(problem: ChargingProblem) -> str:
+    """How the values were drawn, and what of them the controller was told."""
+    schedule = problem.theta.schedule
+    told = ", ".join(axis.name for axis in schedule.schedule.axes) if schedule else ""
+    first = DRAWN.replace("told none of them: it reads", f"told only {told}, which choose its theta: else it reads") if told else DRAWN
+    return first if problem.plant_cell else f"{first} {DRAWN_ELECTROCHEMICAL}"
 
 
 def _traces_of(path: Path) -> Path | None:

@@ -125,16 +125,25 @@ class ChargingRange:
 
     def run(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode]:
         """The episode of each theta on the plant of the same place as it was measured, however it ended."""
+        own = [self._theta(theta, one) for theta, one in zip(thetas, plants, strict=True)]
         if self.problem.plant_cell is not None:
-            return self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
+            return self._loop.run_each(own, [one.plant for one in plants], [one.seed for one in plants])
         from chargetune.episode.stepwise import run_episode
 
         controller, steps = controller_of(self.problem), self.problem.episode.steps
         control = compiled_act(controller)
         return [
             run_episode(controller, self.plant_of(one), steps=steps, theta=theta, seed=one.seed, control=control)
-            for theta, one in zip(thetas, plants, strict=True)
+            for theta, one in zip(own, plants, strict=True)
         ]
+
+    def _theta(self, theta: NDArray[np.float64], drawn: DrawnPlant) -> NDArray[np.float64]:
+        """The controller's theta in the context of this draw."""
+        if self.problem.theta.schedule is None:
+            return theta
+        told = {name: values[0] for name, values in self.values(drawn).items() if name in ("ambient_K", "age")}
+        found = self.problem.theta_in(theta, self.problem.context | told)
+        return theta if found is None else found
 
     def plant_of(self, drawn: DrawnPlant) -> Plant:
         """A new plant of this draw at its start."""

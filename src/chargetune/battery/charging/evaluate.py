@@ -60,7 +60,7 @@ def run_charge(problem: ChargingProblem, theta: ArrayLike | None = None, seed: i
     """One charge with the controller at theta (None: untuned)."""
     # The variable that chooses the compiler may change while a program runs.
     compiled = _EPISODES.get((problem, os.environ.get("CHARGETUNE_CC")), lambda: _compiled(problem))
-    trips = trips_of(problem)
+    trips, theta = trips_of(problem), problem.theta_in(theta)
     if compiled is not None:
         return compiled.run(theta, seed, trips)
     controller, plant = controller_of(problem), plant_of(problem)

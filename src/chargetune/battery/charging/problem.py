@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from chargetune.battery.cell.cell import Cell, mismatched
 from chargetune.battery.charging.kalman import Kalman
@@ -155,6 +156,17 @@ class ChargingProblem:
                 )
             check_number(f"estimator: {part.name}", numbers[part.name], part.lower, part.upper, ", which theta.observer spans")
 
+        thermal, adaptive = self.cell.thermal is not None, self.estimator.kind == "adaptive"
+        for name, over in theta.over.items():
+            over.check(f"theta.{name}", thermal=thermal, adaptive=adaptive)
+        if theta.schedule is not None:
+            if theta.schedule.ambient_K and not thermal:
+                raise ValueError(
+                    f"theta.schedule: ambient_K = {list(theta.schedule.ambient_K)}, allowed only for a cell with a [thermal] table"
+                )
+            theta.schedule.schedule.shares(self.context)
+            _ = self.space
+
     def _check_physics(self) -> None:
         cell, start, highest, backoff = self.cell, self.episode.soc_start, self.voltage_max_V, self.theta.backoff
         resting = float(np.interp(start, cell.ocv_soc, cell.ocv_V))
@@ -174,6 +186,11 @@ class ChargingProblem:
             return
         if self.range.ambient_K is not None and (self.plant_cell or self.cell).thermal is None:
             raise ValueError(f"range: ambient_K = {list(self.range.ambient_K)}, allowed only for a cell with a [thermal] table")
+        if self.theta.schedule is not None:
+            if self.range.ambient_K is not None:
+                self.theta.schedule.check_span("ambient_K", self.range.ambient_K)
+            if self.range.fade or self.range.growth:
+                self.theta.schedule.check_span("age", (0.0, 1.0))
         highest = self.range.soc_start[1] if self.range.soc_start else 0.0
         wanted = self.objective.charge_time_to_soc or self.episode.soc_target
         if highest >= wanted:
@@ -230,6 +247,28 @@ class ChargingProblem:
         return _space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()), self.controller.current_ramp_A_s)
 
     @property
+    def base_space(self) -> ParameterSpace:
+        """The space of the theta of one context: that of the controller."""
+        return _base_space(self.theta, len(self.cell.soc), tuple(self._observer_numbers.items()), self.controller.current_ramp_A_s)
+
+    @property
+    def context(self) -> dict[str, float]:
+        """What is known of the study's own charge before it begins."""
+        thermal = (self.plant_cell or self.cell).thermal
+        ambient = getattr(self.plant, "ambient_K", None) or (thermal.ambient_K if thermal else None)
+        return {"age": 0.0} | ({} if ambient is None else {"ambient_K": ambient})
+
+    def theta_in(self, theta: ArrayLike | None, context: Mapping[str, float] | None = None) -> NDArray[np.float64] | None:
+        """The controller's theta in a context (None: the study's own), by the schedule if there is one; None is untuned.
+
+        Raises ValueError for a context outside the schedule.
+        """
+        settings = self.theta.schedule
+        if theta is None or settings is None:
+            return None if theta is None else np.asarray(theta, dtype=np.float64)
+        return settings.schedule.theta(self.base_space, theta, self.context if context is None else context)
+
+    @property
     def _observer_numbers(self) -> dict[str, float]:
         """The filter's numbers that theta may set, by name."""
         observer = self.estimator.settings
@@ -252,6 +291,11 @@ class ChargingProblem:
 @built_once(64)
 def _space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...], ramp_A_s: float | None) -> ParameterSpace:
     return theta.space(nodes, dict(observer), ramp_A_s)
+
+
+@built_once(64)
+def _base_space(theta: Tunables, nodes: int, observer: tuple[tuple[str, float], ...], ramp_A_s: float | None) -> ParameterSpace:
+    return theta.base_space(nodes, dict(observer), ramp_A_s)
 
 
 def with_feedback(problem: ChargingProblem) -> ChargingProblem:

@@ -47,6 +47,8 @@ class ChargingRangeSettings:
         The voltage sensor reads too much by +- this; new in each charge.
     draws
         Fresh draws of one trial of the tuner "range": where 0.3 % of all plants break a limit, 1000 show one with probability 0.95.
+    drop_idle
+        The tuner "range" puts entries of theta back that are worth nothing: no more plants break a limit, and no time is lost.
 
     Raises ValueError naming field, value and what is allowed.
     """
@@ -62,6 +64,7 @@ class ChargingRangeSettings:
     growth: float = 0.0
     voltage_bias_V: float = 0.0
     draws: int = 1000
+    drop_idle: bool = False
 
     def __post_init__(self) -> None:
         for name, most in (("resistance", 0.9), ("resistance_by_node", 0.9), ("capacitance", 0.9), ("capacitance_by_node", 0.9)):
@@ -72,6 +75,8 @@ class ChargingRangeSettings:
         check_number("range: voltage_bias_V", self.voltage_bias_V, 0.0, 0.1, "V")
         if isinstance(self.draws, bool) or not isinstance(self.draws, int) or not 1 <= self.draws <= DRAWS_MAX:
             raise ValueError(f"range: draws = {self.draws!r}, allowed is an integer in [1, {DRAWS_MAX}]")
+        if not isinstance(self.drop_idle, bool):
+            raise ValueError(f"range: drop_idle = {self.drop_idle!r}, allowed is true or false")
         for name, least, most, unit in (("soc_start", 0.0, 1.0, ""), ("ambient_K", 200.0, 400.0, "K")):
             pair = getattr(self, name)
             if pair is None:

@@ -41,7 +41,7 @@ def check_ringing(problem: ChargingProblem) -> list[Finding]:
         plant = SimulatedPlant(
             ecm_model(cell, problem.controller.sampling_time_s), start_state(cell, problem.episode.soc_start), problem.sensors.sensors()
         )
-        run = compiled_episode(controller_of(problem), plant, problem.episode.steps).run(problem.theta_values)
+        run = compiled_episode(controller_of(problem), plant, problem.episode.steps).run(problem.theta_in(problem.theta_values))
         current = run.input[:, 0]
         swings = _swings(current / (problem.current_max_A - problem.limits.current_min_A))
         over = 1e3 * (float(np.max(run.signal("voltage_V", true=True))) - problem.voltage_max_V)

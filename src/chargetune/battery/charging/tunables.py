@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import prod
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.battery.charging.conditions import Over, ScheduleSettings
+from chargetune.battery.charging.radial_basis import RadialBasis
 from chargetune.battery.validation import check_count, check_number
 from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import Parameter, ParameterSpace
@@ -28,13 +31,15 @@ class Backoff:
     """theta in the set Y: the controller keeps V <= v_max - b(z), b a natural cubic spline on equidistant SOC nodes.
 
     ``at="measured"`` takes b at the measured z_k for the whole horizon (the paper's text), ``"predicted"`` at each z_i.
-    A signed backoff (lower < 0) lets the controller also correct a model that is too pessimistic.
+    A signed backoff (lower < 0) lets the controller also correct a model that is too pessimistic. With ``over`` its node values are a
+    table over temperature or estimated resistance too.
     """
 
     nodes: int = 7
     lower_V: float = -0.25
     upper_V: float = 0.25
     at: Literal["measured", "predicted"] = "measured"
+    over: Over | None = None
 
     def __post_init__(self) -> None:
         check_count("backoff: nodes", self.nodes, 2, 50)
@@ -49,23 +54,26 @@ class Backoff:
 
     @property
     def parameter(self) -> Parameter:
-        return Parameter("backoff_V", self.lower_V, self.upper_V, 0.0, unit="V", size=self.nodes)
+        shape = (*(self.over.shape if self.over else ()), self.nodes)
+        return Parameter("backoff_V", self.lower_V, self.upper_V, 0.0, unit="V", size=prod(shape), shape=shape)
 
     def voltage(self, stage: Stage) -> Any:
         z = stage.now["soc"] if self.at == "measured" else stage.x["soc"]
-        return natural_spline(z, self.grid, stage.theta["backoff_V"])
+        values = stage.theta["backoff_V"]
+        return natural_spline(z, self.grid, self.over.at(stage, values) if self.over else values)
 
 
 @dataclass(frozen=True)
 class LimitBackoff:
     """theta in the sets X, Y: the controller keeps another limit by a margin b, T <= T_max - b or anode >= minimum + b.
 
-    One node is a constant margin; more are a natural cubic spline over the measured SOC. Signed like `Backoff`.
+    One node is a constant margin; more are a natural cubic spline over the measured SOC. Signed, and with ``over``, like `Backoff`.
     """
 
     lower: float
     upper: float
     nodes: int = 1
+    over: Over | None = None
 
     def __post_init__(self) -> None:
         widest = max(most for most, _ in WIDEST.values())
@@ -78,10 +86,12 @@ class LimitBackoff:
         return f"{of}_backoff_{WIDEST[of][1]}"
 
     def parameter(self, of: str) -> Parameter:
-        return Parameter(self.name(of), self.lower, self.upper, 0.0, unit=WIDEST[of][1], size=self.nodes)
+        shape = (*(self.over.shape if self.over else ()), self.nodes)
+        return Parameter(self.name(of), self.lower, self.upper, 0.0, unit=WIDEST[of][1], size=prod(shape), shape=shape)
 
     def margin(self, of: str, stage: Stage) -> Any:
         values = stage.theta[self.name(of)]
+        values = self.over.at(stage, values) if self.over else values
         return values if self.nodes == 1 else natural_spline(stage.now["soc"], np.linspace(0.0, 1.0, self.nodes), values)
 
 
@@ -197,8 +207,8 @@ class ObserverSetting:
 class Tunables:
     """What theta consists of, each part by its place in the controller, and values for it to simulate with.
 
-    ``R0`` to ``R3`` are resistances of the controller's model; ``values`` are of theta by name, what they do not name is untuned. They
-    are no part of what is tuned, so two that differ in nothing else are equal.
+    ``R0`` to ``R3`` are resistances of the controller's model; with a ``schedule`` the parts are tables over contexts. ``values`` are of
+    theta by name, what they do not name is untuned. They are no part of what is tuned, so two that differ in nothing else are equal.
     """
 
     backoff: Backoff | None = None
@@ -208,10 +218,12 @@ class Tunables:
     R3: ResistanceRatio | None = None
     current_limit: CurrentLimit | None = None
     current_ramp: CurrentRamp | None = None
+    rbf: RadialBasis | None = None
     temperature_backoff: LimitBackoff | None = None
     anode_backoff: LimitBackoff | None = None
     voltage_sd: MeasurementSpread | None = None
     observer: tuple[ObserverSetting, ...] = ()
+    schedule: ScheduleSettings | None = None
     values: Mapping[str, float | list[float]] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -240,8 +252,25 @@ class Tunables:
         """Names of the filter's numbers that are tuned."""
         return (*(["voltage_sd_V"] if self.voltage_sd else []), *(part.name for part in self.observer))
 
+    @property
+    def over(self) -> dict[str, Over]:
+        """The tables over conditions, by the part of theta that is one."""
+        parts = {"backoff": self.backoff, **{f"{of}_backoff": part for of, part in self.limit_backoffs.items()}}
+        return {name: part.over for name, part in parts.items() if part is not None and part.over is not None}
+
+    @property
+    def curves(self) -> Tunables:
+        """What of it is a curve over the SOC alone: nothing with a schedule, and no table over conditions."""
+        tables: dict[str, Any] = dict.fromkeys(self.over)
+        return Tunables() if self.schedule else replace(self, **tables)
+
     def space(self, nodes: int, observer: Mapping[str, float], ramp_A_s: float | None) -> ParameterSpace:
         """The space of theta for a cell with so many SOC nodes, a filter with these numbers by name, and this ramp of the current."""
+        base = self.base_space(nodes, observer, ramp_A_s)
+        return self.schedule.space(base) if self.schedule else base
+
+    def base_space(self, nodes: int, observer: Mapping[str, float], ramp_A_s: float | None) -> ParameterSpace:
+        """The space of the theta of one context, which is what the controller has."""
         return ParameterSpace(
             (
                 *([self.backoff.parameter] if self.backoff else []),
@@ -249,6 +278,7 @@ class Tunables:
                 *(part.parameter(of) for of, part in self.limit_backoffs.items()),
                 *([self.current_limit.parameter] if self.current_limit else []),
                 *([self.current_ramp.parameter(ramp_A_s)] if self.current_ramp and ramp_A_s is not None else []),
+                *([self.rbf.parameter] if self.rbf else []),
                 *([self.voltage_sd.parameter(observer["voltage_sd_V"])] if self.voltage_sd else []),
                 *(part.parameter(observer[part.name]) for part in self.observer),
             )

@@ -53,6 +53,11 @@ def make_tuner(
         raise ValueError(f"[safety] is given with tuner = {name!r}, allowed is tuner = 'twin': it alone predicts what it has not tried")
     if unknown and name != "twin":
         raise ValueError(f"[twin] is given with tuner = {name!r}, allowed is tuner = 'twin': the others have no model of the plant")
+    if problem.theta.schedule and name != "range":
+        raise ValueError(
+            f"[theta.schedule] is given with tuner = {name!r}, allowed is tuner = 'range': the others charge in one context, in which "
+            "most of the table has no say"
+        )
     # torch is needed from here on only.
     from chargetune import learning
 
@@ -78,7 +83,9 @@ def make_tuner(
         "sobol": lambda s: learning.Sobol(seed=s),
         "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
         "iterative_learning": lambda _: learning.IterativeLearning(twin),
-        "range": lambda s: learning.RangeTuner(_over_range(problem), seed=s),
+        "range": lambda s: learning.RangeTuner(
+            _over_range(problem), seed=s, settings=learning.RangeSettings(drop_idle=problem.range is not None and problem.range.drop_idle)
+        ),
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)

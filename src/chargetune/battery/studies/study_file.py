@@ -180,10 +180,21 @@ class Config(_Table):
         if isinstance(settings, (OffsetFree, Adaptive)):
             # Defaults may change; what decides the trials does not.
             data["estimator"][str(self.estimator.kind)] = asdict(settings)
-        absent = (("controller", "current_ramp_A_s"), ("theta", "observer"), ("theta", "current_ramp"))
+        absent = (
+            ("controller", "current_ramp_A_s"),
+            ("theta", "observer"),
+            ("theta", "current_ramp"),
+            ("theta", "rbf"),
+            ("theta", "schedule"),
+        )
         for table, name in (*absent, *(("estimator", name) for name in FILTERS)):
             if not data[table][name]:
                 del data[table][name]
+        if data.get("range") and not data["range"]["drop_idle"]:
+            del data["range"]["drop_idle"]
+        for part in ("backoff", "temperature_backoff", "anode_backoff"):
+            if data["theta"][part] and not data["theta"][part]["over"]:
+                del data["theta"][part]["over"]
         return data | _as_recorded(data)
 
     def _cell(self, folder: Path | None) -> Cell:

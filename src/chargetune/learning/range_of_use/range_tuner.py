@@ -13,6 +13,7 @@ from chargetune.learning.closed_loop.loop import samples_of
 from chargetune.learning.closed_loop.slp import Point, solve_slp
 from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.range_of_use.range_verdict import PlantResult, RangeEvaluation, objective_over
+from chargetune.learning.range_of_use.worth import without_idle
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.range_of_use import DrawnPlant
@@ -35,6 +36,8 @@ class RangeSettings:
         among the starts: which is clearly worse shows on a few.
     iterations, gain
         Of the search, and the share of the objective that one has to win.
+    drop_idle
+        Entries of the theta found that are worth nothing on its plants are put back (`without_idle`).
     """
 
     plants: int = 48
@@ -44,6 +47,8 @@ class RangeSettings:
     pool: int = 32
     iterations: int = 20
     gain: float = 5e-4
+    # A study's configuration has it.
+    drop_idle: bool = field(default=False, metadata={"identity": False})
 
     def __post_init__(self) -> None:
         for name in ("plants", "added", "first", "pool", "iterations"):
@@ -86,7 +91,10 @@ class RangeTuner:
         last = space.to_unit(np.array(done[-1].theta) if done else space.default)
         # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
         found = [search.refine(start) for start in {u.tobytes(): u for u in (last, self._start(space, search, last))}.values()]
-        return np.tile(space.from_unit(min(found, key=search.merit_of_all)), (n, 1))
+        theta = space.from_unit(min(found, key=search.merit_of_all))
+        if self.settings.drop_idle:
+            theta = without_idle(self.evaluation, space, theta, [*added, *common])
+        return np.tile(theta, (n, 1))
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""

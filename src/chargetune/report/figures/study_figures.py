@@ -25,11 +25,12 @@ def _drawings(view: StudyView) -> dict[str, Callable[[StudyView], Figure]]:
     if view.problem is not None:
         if any(t.trace_sha256 is not None for t in view.trials):
             drawings["trajectories"] = trajectories_figure
-        if view.problem.theta.backoff is not None:
+        curves = view.problem.theta.curves
+        if curves.backoff is not None:
             drawings["backoff"] = backoff_figure
-        if view.problem.theta.current_limit is not None:
+        if curves.current_limit is not None:
             drawings["current_limit"] = current_limit_figure
-        drawings |= {of: partial(resistance_figure, of=of) for of in view.problem.theta.ratios}
+        drawings |= {of: partial(resistance_figure, of=of) for of in curves.ratios}
     return {**drawings, "convergence": convergence_figure}
 
 

@@ -68,22 +68,23 @@ def profiles(view: StudyView, theta: NDArray[np.float64]) -> list[dict[str, Any]
     problem, out = view.problem, []
     if problem is None:
         return []
+    curves = problem.theta.curves
     slices, soc = view.space.slices, 100 * SOC[::2]
-    if problem.theta.backoff is not None:
+    if curves.backoff is not None:
         nodes = theta[slices["backoff_V"]]
-        curve = 1e3 * backoff_values(problem.theta.backoff, nodes)[::2]
-        out.append(_profile("backoff", "backoff b (mV)", soc, curve, 100 * problem.theta.backoff.grid, 1e3 * nodes))
-    for of, part in problem.theta.limit_backoffs.items():
+        curve = 1e3 * backoff_values(curves.backoff, nodes)[::2]
+        out.append(_profile("backoff", "backoff b (mV)", soc, curve, 100 * curves.backoff.grid, 1e3 * nodes))
+    for of, part in curves.limit_backoffs.items():
         factor, unit = (1.0, "K") if of == "temperature" else (1e3, "mV")
         nodes, grid = factor * theta[slices[part.name(of)]], np.linspace(0.0, 1.0, part.nodes)
         spline = CubicSpline(grid, nodes, bc_type="natural")(SOC[::2]) if part.nodes > 1 else np.full(SOC[::2].size, nodes[0])
         out.append(_profile(part.name(of), f"{of} backoff ({unit})", soc, spline, 100 * grid, nodes))
-    if problem.theta.current_limit is not None:
-        largest, grid = problem.current_max_A, problem.theta.current_limit.grid
+    if curves.current_limit is not None:
+        largest, grid = problem.current_max_A, curves.current_limit.grid
         nodes = theta[slices["current_limit"]]
         curve = current_limit_values(problem, nodes)[::2]
         out.append(_profile("current_limit", "current limit (A)", soc, curve, 100 * grid, largest * nodes))
-    for of, ratio in problem.theta.ratios.items():
+    for of, ratio in curves.ratios.items():
         believed = np.array(getattr(problem.controller_cell, f"{of}_ohm"))
         nodes = 1e3 * believed * theta[slices[ratio.name(of)]]
         curve = 1e3 * resistance_values(problem.cell.soc, nodes / 1e3)[::2]
