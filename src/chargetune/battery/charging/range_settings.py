@@ -62,6 +62,7 @@ class ChargingRangeSettings:
     growth: float = 0.0
     voltage_bias_V: float = 0.0
     draws: int = 1000
+    """Fresh draws of one trial of the tuner "range"."""
 
     def __post_init__(self) -> None:
         for name, most in (("resistance", 0.9), ("resistance_by_node", 0.9), ("capacitance", 0.9), ("capacitance_by_node", 0.9)):
