@@ -101,8 +101,8 @@ def table_of(
         if inner:
             # What may be one of several tables is told by each of them.
             told = beside.get(name, "") if len(inner) == 1 else ""
-            many = get_origin(plain) in (list, tuple)
-            tables += [table_of(one, (*path, name), sentence=told, many=many, texts=texts) for one in inner]
+            several = get_origin(plain) in (list, tuple)
+            tables += [table_of(one, (*path, name), sentence=told, many=several, texts=texts) for one in inner]
         else:
             in_words(plain)
             keys.append(Key(name, plain, default, beside.get(name, ""), _unit(name, plain)))
