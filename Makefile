@@ -14,7 +14,7 @@ READY := .venv/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 LOCK_VENV := build/lock-venv
 
-.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock clean
+.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock reference docs gallery clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
@@ -69,12 +69,23 @@ lock: ## renew requirements.lock from the ranges in pyproject.toml
 	rm -rf $(LOCK_VENV)
 	$(PYTHON) -m venv $(LOCK_VENV)
 	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)"
-	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench,dask,excel,export,gym,notebook,postgres,pybamm,web]'
+	$(LOCK_VENV)/bin/pip install --quiet "$$(grep '^torch==' requirements.lock)" --editable '.[dev,bench,dask,docs,excel,export,gym,notebook,postgres,pybamm,web]'
 	{ grep '^#' requirements.lock; \
 	  $(LOCK_VENV)/bin/pip freeze --all --exclude-editable --exclude pip \
 	  | sed 's/+cpu$$//' | grep -Ev '^(cuda|nvidia|triton)'; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
 
+# -W: a warning, such as a link that leads nowhere, is an error.
+docs: $(READY) ## build the site into build/site, without running the scripts of the gallery
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+
+gallery: export CHARGETUNE_GALLERY := 1
+gallery: $(READY) ## build the site with what the scripts of the gallery print and draw
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+
+reference: $(READY) ## write the pages and schemas of every key of a file, docs/reference
+	$(BIN)/python docs/make_reference.py
+
 clean: ## remove the environment, caches and outputs
-	rm -rf .venv build dist out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
+	rm -rf .venv build dist out docs/gallery .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +

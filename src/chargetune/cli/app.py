@@ -37,6 +37,14 @@ class ExportFormat(StrEnum):
     CSV = "csv"
 
 
+class FileKind(StrEnum):
+    """The files that a person writes."""
+
+    STUDY = "study"
+    CELL = "cell"
+    CAMPAIGN = "campaign"
+
+
 class CaseName(StrEnum):
     """The case studies."""
 
@@ -92,6 +100,14 @@ def init(
     from chargetune.cli.init import init_command
 
     init_command(path, cell=cell, overwrite=overwrite)
+
+
+@app.command()
+def schema(kind: Annotated[FileKind, typer.Argument(help="Kind of file.")] = FileKind.STUDY) -> None:
+    """Print the JSON schema of a file, by which an editor completes and checks it: every key with unit, default and range."""
+    from chargetune.cli.schema import schema_command
+
+    schema_command(kind.value)
 
 
 @app.command()

@@ -17,6 +17,9 @@ __all__ = ["init_command"]
 TEXT = """\
 # A study of fast charging. Every key is optional; what stands here is the default or a sensible beginning.
 # Next: `chargetune check {name}`, then `chargetune tune {name}`.
+# All keys: docs/reference/study-file.md. An editor completes them after `chargetune schema study > study.schema.json`
+# and with this as the first line of the file, without the first "# ":
+# #:schema ./study.schema.json
 
 [study]
 name = "{stem}"

@@ -21,6 +21,7 @@ class GymnasiumPlant:
 
     outputs
         Signals of the observation, in its order, or of what ``observe`` makes of it: observation -> outputs, shape (ny,).
+
     An output has no direct feedthrough: at the start of an interval it is as at the end of the one before. ``reset`` seeds the
     environment. An environment that ends itself (terminated) or is past its time (truncated) is a `PlantError`.
     """

@@ -20,11 +20,17 @@ class Kalman:
     """
 
     voltage_sd_V: float = 0.05
+    """Standard deviation of the voltage's error, the model's as well as the sensor's."""
     temperature_sd_K: float = 0.3
+    """Standard deviation of the temperature's error."""
     soc_start_sd: float = 0.02
+    """Standard deviation of the SOC at the start."""
     soc_process_sd: float = 1e-5
+    """What an interval adds to the SOC, standard deviation."""
     overpotential_process_sd_V: float = 1e-4
+    """What an interval adds to each overpotential, standard deviation."""
     temperature_process_sd_K: float = 0.05
+    """What an interval adds to the temperature, standard deviation."""
 
     def __post_init__(self) -> None:
         for part in fields(self):

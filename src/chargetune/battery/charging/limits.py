@@ -106,16 +106,27 @@ class LimitSettings:
     """
 
     current_min_A: float = 0.0
+    """Lowest current; 0: the cell is not discharged."""
     current_max_A: float | None = None
+    """Largest current; not given: the cell's."""
     voltage_min_V: float | None = None
+    """Lower limit of the voltage; not given: the cell's."""
     voltage_max_V: float | None = None
+    """Upper limit of the voltage; not given: the cell's."""
     tolerance_V: float = 5e-4
+    """Excess over a voltage limit that is still called kept."""
     temperature_max_K: float | None = None
+    """Upper limit of the temperature; not given: no limit."""
     tolerance_K: float = 0.05
+    """Excess over the temperature limit that is still called kept."""
     anode_min_V: float | None = None
+    """Lower limit of the anode potential against lithium, below 0 V lithium plates; not given: no limit."""
     tolerance_anode_V: float = 5e-4
+    """Excess beyond the anode's limit that is still called kept."""
     hard: tuple[str, ...] = ()
+    """Limits that are worth more than every soft one and the objective: names of limits that are set."""
     scored_only: tuple[str, ...] = ()
+    """Limits that are judged but that the controller does not see: names of limits that are set."""
 
     def __post_init__(self) -> None:
         check_number("tolerance_V", self.tolerance_V, 0.0, 0.1, "V")

@@ -53,16 +53,27 @@ class OffsetFree:
     """
 
     soc: Literal["counted", "measured"] = "counted"
+    """"counted": the SOC is counted from the current; "measured": it is read."""
     soc_from_rest: bool = True
+    """Whether the first voltage, at rest, sets the SOC through the OCV."""
     voltage_sd_V: float = 2e-3
+    """Standard deviation of the voltage's noise."""
     offset_start_sd_V: float = 5e-3
+    """Standard deviation of the voltage's offset at the start."""
     offset_drift_V: float = 3e-3
+    """What a minute adds to the voltage's offset, standard deviation."""
     resistance_drift: float = 0.15
+    """What the whole SOC adds to the relative error of the resistances, standard deviation."""
     backoff_sd: float = 3.0
+    """Margin to the voltage limit in standard deviations of the voltage one interval ahead; 0: none."""
     soc_sd: float = 1e-3
+    """Standard deviation of a measured SOC."""
     temperature_sd_K: float = 0.1
+    """Standard deviation of the temperature's noise."""
     temperature_drift_K: float = 0.5
+    """What a minute adds to the temperature, standard deviation."""
     gate_sd: float | None = None
+    """A sample further off than so many standard deviations is left out; not given: none is."""
 
     def __post_init__(self) -> None:
         _check("offset_free", self, ("counted", "measured"))
@@ -87,23 +98,41 @@ class Adaptive:
     """
 
     soc: Literal["counted", "measured", "estimated"] = "estimated"
+    """"counted" or "measured" as in offset_free; "estimated": the voltage corrects the counted SOC."""
     soc_from_rest: bool = True
+    """Whether the first voltage, at rest, sets the SOC through the OCV."""
     voltage_sd_V: float = 2e-3
+    """Standard deviation of the voltage's noise."""
     offset_start_sd_V: float = 5e-3
+    """Standard deviation of the voltage's offset at the start."""
     offset_drift_V: float = 2e-3
+    """What a minute adds to the voltage's offset, standard deviation."""
     resistance_start_sd: float = 0.3
+    """Standard deviation of the logarithm of the common resistance factor at the start."""
     resistance_drift: float = 0.05
+    """Random walk of that logarithm over the whole SOC, standard deviation."""
     resistance_rate_start_sd: float = 5.0
+    """Standard deviation of its rate of change with SOC at the start."""
     resistance_rate_drift: float = 12.0
+    """Random walk of that rate over the whole SOC, standard deviation."""
     resistance_rate_decay: float = 0.04
+    """How much of the SOC a rate reaches."""
     overpotential_drift_V: float = 1e-3
+    """What a minute adds to each overpotential, standard deviation."""
     soc_start_sd: float = 5e-3
+    """Standard deviation of the SOC at the start, for "estimated"."""
     soc_drift: float = 1e-4
+    """What a minute adds to the SOC, standard deviation, for "estimated"."""
     backoff_sd: float = 3.0
+    """Margin to the voltage limit in standard deviations of the voltage one interval ahead; 0: none."""
     soc_sd: float = 1e-3
+    """Standard deviation of a measured SOC."""
     temperature_sd_K: float = 0.1
+    """Standard deviation of the temperature's noise."""
     temperature_drift_K: float = 0.5
+    """What a minute adds to the temperature, standard deviation."""
     gate_sd: float | None = 5.0
+    """A sample further off than so many standard deviations is left out, but never two in a row."""
 
     def __post_init__(self) -> None:
         _check("adaptive", self, ("counted", "measured", "estimated"))

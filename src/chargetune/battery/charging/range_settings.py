@@ -64,7 +64,9 @@ class ChargingRangeSettings:
     growth: float = 0.0
     voltage_bias_V: float = 0.0
     draws: int = 1000
+    """Fresh draws of one trial of the tuner "range"."""
     drop_idle: bool = False
+    """Whether entries of theta that are worth nothing are put back and left out of the search."""
 
     def __post_init__(self) -> None:
         for name, most in (("resistance", 0.9), ("resistance_by_node", 0.9), ("capacitance", 0.9), ("capacitance_by_node", 0.9)):

@@ -25,17 +25,20 @@ SENSOR_ERRORS = {
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """The controller and what it wrongly believes; no ``mismatch_seed`` means that it knows the cell.
-
-    ``penalty_per_V`` is the exact penalty of the voltage limits; the other limits' follow from it. ``current_ramp_A_s`` is by how much
-    the current may rise per second, so that the first intervals show the resistance before the current is large; None: at once.
-    """
+    """The controller and what it wrongly believes."""
 
     sampling_time_s: float = 10.0
+    """Length of one control interval, in which the current is constant."""
     horizon: int = 5
+    """Intervals that the controller looks ahead."""
     mismatch_seed: int | None = None
+    """Seed by which the controller's resistances and capacitances are drawn wrong by up to a half; not given: it knows the cell."""
     penalty_per_V: float = 1e3
+    """Exact penalty of the voltage limits, in cost per volt; those of the other limits follow from it."""
     current_ramp_A_s: float | None = None
+    """By how much the current may rise per second, so that the first intervals show an unknown resistance before the current is large;
+    not given: at once.
+    """
 
     def __post_init__(self) -> None:
         check_number("sampling_time_s", self.sampling_time_s, 1e-3, 3600.0, "s")
@@ -62,17 +65,20 @@ class EstimatorSettings:
         real cell tells. "kalman": a filter on voltage and temperature estimates SOC and overpotentials (`Kalman`). "offset_free": the
         voltage's error is a disturbance that a filter follows, the SOC is counted (`OffsetFree`). "adaptive": the same with a
         common factor of the resistances (`Adaptive`). None: that whose settings are given, else open_loop.
-    soc_start_error
-        What is believed of the SOC at the start less the truth; no more than a guess where the voltage at rest sets it.
-    kalman, offset_free, adaptive
-        The settings of the kind of that name; None: its defaults.
     """
 
     kind: Kind | None = None
+    """"open_loop": the voltage is not read; "exact": every state is known; "kalman", "offset_free", "adaptive": a filter reads the
+    voltage. Not given: that whose table is given, else open_loop.
+    """
     soc_start_error: float = 0.0
+    """What is believed of the SOC at the start less the truth; without effect where the voltage at rest sets it."""
     kalman: Kalman | None = None
+    """The filter of kind "kalman"."""
     offset_free: OffsetFree | None = None
+    """The observer of kind "offset_free"."""
     adaptive: Adaptive | None = None
+    """The observer of kind "adaptive"."""
 
     def __post_init__(self) -> None:
         check_number("soc_start_error", self.soc_start_error, -0.5, 0.5)
@@ -115,8 +121,11 @@ class EpisodeSettings:
     """One charge: its largest number of intervals, and the SOC that it begins at and is to reach."""
 
     steps: int = 360
+    """Intervals of one charge at most."""
     soc_start: float = 0.05
+    """SOC at the start."""
     soc_target: float = 1.0
+    """SOC to be reached, more than soc_start."""
 
     def __post_init__(self) -> None:
         check_count("steps", self.steps, 1, 1_000_000)
@@ -131,13 +140,21 @@ class SensorSettings:
     """Imperfect measurement of the plant."""
 
     voltage_noise_sd_V: float = 0.0
+    """Standard deviation of the noise on the voltage."""
     voltage_bias_V: float = 0.0
+    """Constant error of the voltage."""
     voltage_resolution_V: float = 0.0
+    """Step to which the voltage is rounded; 0: not rounded."""
     temperature_noise_sd_K: float = 0.0
+    """Standard deviation of the noise on the temperature."""
     temperature_bias_K: float = 0.0
+    """Constant error of the temperature."""
     soc_noise_sd: float = 0.0
+    """Standard deviation of the noise on the SOC."""
     soc_bias: float = 0.0
+    """Constant error of the SOC."""
     delay_steps: int = 0
+    """Intervals by which every measurement is late."""
 
     def __post_init__(self) -> None:
         for quantity, (most, unit) in SENSOR_ERRORS.items():
@@ -163,22 +180,16 @@ def _given(**values: float) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Objective:
-    """What a charge is worth, and how closely its limits are looked at.
-
-    c1
-        Weight of the paper's scalar performance G.
-    charge_time_to_soc
-        The SOC to which the time of charge is minimised; None: the mean squared lack of charge is.
-    soc_windows
-        Equal parts of the SOC in each of which the worst excess of a limit is told to the tuner.
-    verdict_samples
-        Intervals of the moving mean by which a noisy signal is judged.
-    """
+    """What a charge is worth, and how closely its limits are looked at."""
 
     c1: float = 1e-5
+    """Weight c1 of the published scalar performance G, which the tuner "ei" maximises."""
     charge_time_to_soc: float | None = None
+    """SOC to which the time of charge is minimised; not given: the mean squared lack of charge is minimised."""
     soc_windows: int = 5
+    """Equal parts of the SOC in each of which the tuner is told the worst excess of a limit."""
     verdict_samples: int = 1
+    """Intervals of the moving mean by which a noisy signal is judged; 1: each sample by itself."""
 
     def __post_init__(self) -> None:
         check_number("c1", self.c1, 0.0, 1.0, "", open_low=True)
@@ -192,16 +203,19 @@ class Objective:
 class SafetySettings:
     """Safe learning by the twin: what must be likely, where to begin, what may be spent, when an episode is ended.
 
-    ``start`` holds values of theta by name; without it the most cautious corner is the start. ``abort_margin_V`` and
-    ``abort_margin_K`` end an episode as soon as a measured voltage or temperature is so far beyond its upper limit: the plant is
-    closed, its current is 0, the trial failed and its trace is kept.
+    A plant whose episode is ended is closed: its current is 0, the trial failed and its trace is kept.
     """
 
     probability: float = 0.95
+    """Probability with which every limit must be predicted to be kept before a theta is tried."""
     start: Mapping[str, float | list[float]] | None = field(default=None, hash=False)
+    """A theta that is known to be safe, values by name; not given: the most cautious corner of its bounds."""
     budget_mVs: float | None = None
+    """Excess over the voltage limit, integrated over time, that may be spent in all; not given: no budget."""
     abort_margin_V: float | None = 0.02
+    """An episode ends as soon as a measured voltage is so far over its limit."""
     abort_margin_K: float | None = 2.0
+    """An episode ends as soon as a measured temperature is so far over its limit."""
 
     def __post_init__(self) -> None:
         p = self.probability

@@ -36,10 +36,15 @@ class Backoff:
     """
 
     nodes: int = 7
+    """Equidistant SOC nodes of the spline, the number of values in theta."""
     lower_V: float = -0.25
+    """Lowest margin; below 0 the limit is exceeded in the model."""
     upper_V: float = 0.25
+    """Largest margin."""
     at: Literal["measured", "predicted"] = "measured"
+    """Where the spline is read: at the "measured" SOC for the whole horizon, or at each "predicted" one."""
     over: Over | None = None
+    """Conditions that the margin depends on beside the SOC: nodes of temperature_K or of resistance_factor."""
 
     def __post_init__(self) -> None:
         check_count("backoff: nodes", self.nodes, 2, 50)
@@ -71,9 +76,13 @@ class LimitBackoff:
     """
 
     lower: float
+    """Lowest margin, in the unit of the limit."""
     upper: float
+    """Largest margin, in the unit of the limit."""
     nodes: int = 1
+    """1: a constant margin; more: SOC nodes of a spline."""
     over: Over | None = None
+    """Conditions that the margin depends on beside the SOC: nodes of temperature_K or of resistance_factor."""
 
     def __post_init__(self) -> None:
         widest = max(most for most, _ in WIDEST.values())
@@ -103,8 +112,11 @@ class ResistanceRatio:
     """
 
     lower: float = 0.1
+    """Smallest factor on the controller's own resistance."""
     upper: float = 6.0
+    """Largest factor."""
     scale: bool = False
+    """true: one factor for the whole table; false: one for each SOC node."""
 
     def __post_init__(self) -> None:
         # The untuned controller's own resistance lies between them.
@@ -130,7 +142,9 @@ class CurrentLimit:
     """
 
     nodes: int = 6
+    """Equidistant SOC nodes from 0 to 1, the number of values in theta."""
     lower: float = 0.1
+    """Lowest value of a node, as share of the largest current."""
 
     def __post_init__(self) -> None:
         check_count("current limit: nodes", self.nodes, 2, 50)
@@ -156,7 +170,9 @@ class CurrentRamp:
     """
 
     lower_A_s: float
+    """Smallest ramp."""
     upper_A_s: float
+    """Largest ramp, more than lower_A_s."""
 
     def __post_init__(self) -> None:
         check_number("current ramp: lower_A_s", self.lower_A_s, 1e-6, 1e4, "A/s")
@@ -174,7 +190,9 @@ class MeasurementSpread:
     """
 
     lower_V: float = 1e-3
+    """Smallest standard deviation."""
     upper_V: float = 0.2
+    """Largest standard deviation, more than lower_V."""
 
     def __post_init__(self) -> None:
         check_number("voltage spread: lower_V", self.lower_V, 1e-6, 1.0, "V")
@@ -192,8 +210,11 @@ class ObserverSetting:
     """
 
     name: str
+    """Key of [estimator.offset_free] or [estimator.adaptive] that is tuned."""
     lower: float
+    """Smallest value, in the unit of that key."""
     upper: float
+    """Largest value, more than lower."""
 
     def __post_init__(self) -> None:
         check_number(f"observer: lower of {self.name}", self.lower, 1e-9, 1e3)
@@ -212,19 +233,33 @@ class Tunables:
     """
 
     backoff: Backoff | None = None
+    """Margin to the upper voltage limit over the SOC."""
     R0: ResistanceRatio | None = None
+    """Factors on R0 of the controller's model."""
     R1: ResistanceRatio | None = None
+    """Factors on R1."""
     R2: ResistanceRatio | None = None
+    """Factors on R2."""
     R3: ResistanceRatio | None = None
+    """Factors on R3."""
     current_limit: CurrentLimit | None = None
+    """Upper limit of the current over the SOC."""
     current_ramp: CurrentRamp | None = None
+    """How fast the current may rise."""
     rbf: RadialBasis | None = None
+    """Weights of a radial-basis stage cost."""
     temperature_backoff: LimitBackoff | None = None
+    """Margin to the temperature limit."""
     anode_backoff: LimitBackoff | None = None
+    """Margin to the anode's limit."""
     voltage_sd: MeasurementSpread | None = None
+    """The voltage's standard deviation in the Kalman filter."""
     observer: tuple[ObserverSetting, ...] = ()
+    """Numbers of the observer, a list of tables [[theta.observer]]."""
     schedule: ScheduleSettings | None = None
+    """Contexts of a charge over which parts of theta are interpolated."""
     values: Mapping[str, float | list[float]] = field(default_factory=dict, compare=False)
+    """Values of theta by name to simulate with; what is not named is untuned."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "observer", tuple(self.observer))

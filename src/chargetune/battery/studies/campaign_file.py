@@ -13,9 +13,13 @@ class CampaignTable(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     configs: list[str] = Field(min_length=1)
+    """Study files, relative to the campaign file; at least one."""
     seeds: str | list[int] = Field(default="0:1")
+    """Seeds of each study: a list of whole numbers, or "A:B" for A to B - 1."""
     trials: int | None = Field(default=None, ge=1)
+    """Trials of each study; not given: the number in the study file."""
     mismatch_from_seed: bool = False
+    """Whether the seed also draws the controller's wrong model (controller.mismatch_seed)."""
 
 
 class CampaignFile(BaseModel):
@@ -24,3 +28,4 @@ class CampaignFile(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     campaign: CampaignTable
+    """The studies of the campaign."""

@@ -53,18 +53,26 @@ class EarlierTable(_Table):
     """An earlier study whose trials are initial data of this one: its store, a file or postgresql://..., and its name."""
 
     store: str = Field(min_length=1)
+    """Store of the earlier study: a file, relative to the study file, or postgresql://user@host/database."""
     study: str = Field(min_length=1)
+    """Name of the study in that store."""
 
 
 class StudyTable(_Table):
     """What is tuned how: name in the store, tuner, number of trials, seed, trials proposed at a time, earlier studies."""
 
     name: str = "study"
+    """Name of the study in its store."""
     tuner: TunerName = "default"
+    """How the next theta is chosen; "range" needs a table [range], "twin" learns a model of the plant from charge to charge."""
     trials: int = Field(default=60, ge=1)
+    """Number of trials in all."""
     seed: int = Field(default=0, ge=0)
+    """Seed of everything that is drawn at random."""
     batch: int = Field(default=1, ge=1)
+    """Trials that are proposed together, for as many workers."""
     earlier: list[EarlierTable] = Field(default_factory=list)
+    """Earlier studies whose trials are data of this one from the start, a list of tables [[study.earlier]]."""
 
     @field_validator("name")
     @classmethod
@@ -109,27 +117,44 @@ class TwinTable(_Table):
     """
 
     resistance_spread: float = Field(default=0.4, gt=0.0, le=2.0)
+    """Standard deviation of the logarithm of every R and C."""
     capacity_spread: float = Field(default=0.0, ge=0.0, le=0.3)
+    """Relative standard deviation of the capacity; 0: it is known exactly."""
     soc_spread: float = Field(default=0.0, ge=0.0, le=0.3)
+    """Standard deviation of the SOC at the start; 0: it is known exactly."""
     ocv_spread_V: float = Field(default=0.0, ge=0.0, le=0.1)
+    """Standard deviation of a constant error of the OCV; 0: it is known exactly."""
 
 
 class Config(_Table):
     """The whole file; every table may be left out."""
 
     study: StudyTable = StudyTable()
+    """What is tuned how."""
     cell: CellTable = CellTable()
+    """The plant's cell."""
     plant: PlantTable | None = None
+    """The plant, where it is not the circuit of [cell]."""
     controller: ControllerSettings = ControllerSettings()
+    """The controller and what it wrongly believes."""
     estimator: EstimatorSettings = EstimatorSettings()
+    """What the controller knows of the state, and how."""
     limits: LimitSettings = LimitSettings()
+    """Limits of the charge."""
     episode: EpisodeSettings = EpisodeSettings()
+    """One charge."""
     sensors: SensorSettings = SensorSettings()
+    """Errors of what is measured."""
     objective: Objective = Objective()
+    """What a charge is worth."""
     theta: Tunables = Tunables()
+    """What is tuned."""
     safety: SafetySettings | None = None
+    """Safe mode: only theta that are predicted to keep the limits are tried."""
     twin: TwinTable | None = None
+    """What is unknown of the plant before the first trial, for the tuner "twin"."""
     range: ChargingRangeSettings | None = None
+    """What differs between the cells and charges that the controller will meet."""
 
     def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant_cell: Cell | None = None) -> ChargingProblem:
         """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant_cell`` stand in for the files'.

@@ -48,7 +48,7 @@ class RangeLoop(Protocol):
 
 @dataclass(frozen=True)
 class SimulatedRange:
-    """The `RangeLoop` of a controller and a simulated plant with `Variation`s.
+    """The `RangeLoop` of a controller and a simulated plant whose numbers differ (`Variation`).
 
     The estimator reads what the drawn sensors measure; the limits are judged by the true outputs, `ScoredLimit` by `ScoredLimit`.
     ``given``: the given signals of controller and plant, one set for all draws or several cases (days, forecasts), of which each draw
