@@ -22,19 +22,18 @@ RESISTANCE_STATE = "resistance_log_factor"
 class Over:
     """A table of a backoff over what is known when the input is chosen, beside the SOC; linear in between, held beyond.
 
-    temperature_K, temperature_nodes
-        [lowest, highest] of the cell's temperature, and equidistant nodes of the table from one to the other.
-    resistance_factor, resistance_nodes
-        The same of the factor of the resistances that the observer `Adaptive` estimates.
-
     The values at a temperature and a factor are those over the SOC next to each other, the factor's nodes one after the other, then the
     temperature's.
     """
 
     temperature_K: tuple[float, float] | None = None
+    """[lowest, highest] of the cell's temperature in the table."""
     temperature_nodes: int = 2
+    """Equidistant nodes from one to the other."""
     resistance_factor: tuple[float, float] | None = None
+    """[lowest, highest] of the factor of the resistances that the observer "adaptive" estimates."""
     resistance_nodes: int = 2
+    """Equidistant nodes from one to the other."""
 
     def __post_init__(self) -> None:
         if self.temperature_K is None and self.resistance_factor is None:
@@ -91,19 +90,15 @@ def _hats(value: Any, pair: tuple[float, float], nodes: int) -> Any:
 class ScheduleSettings:
     """theta by context (`Schedule`): what is known of a charge before it begins, as nodes of a table.
 
-    ambient_K
-        Of the ambient temperature, in K; only with a [thermal] table.
-    age
-        Of the age a in [0, 1] that ``range.fade`` and ``range.growth`` speak of.
-    parts
-        Names of theta's parts that differ, as in backoff_V; none: all do.
-
     A charge in a context outside the nodes is refused.
     """
 
     ambient_K: tuple[float, ...] | None = None
+    """Nodes of the ambient temperature; only with a [thermal] table in the cell file."""
     age: tuple[float, ...] | None = None
+    """Nodes of the age from 0 to 1 that range.fade and range.growth speak of."""
     parts: tuple[str, ...] = ()
+    """Names of theta's parts that differ by context, such as "backoff_V"; none: all do."""
 
     def __post_init__(self) -> None:
         for name, least, most, unit in (("ambient_K", 200.0, 400.0, "K"), ("age", 0.0, 1.0, "")):

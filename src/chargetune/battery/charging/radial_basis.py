@@ -22,7 +22,7 @@ RBF_MAX = 20
 
 @dataclass(frozen=True)
 class RadialBasis:
-    """A radial-basis network over the predicted SOC and voltage is added to it,.
+    """A radial-basis network over the predicted SOC and voltage, added to the stage cost.
 
         l(z, V) = (z_d - z)^2 + sum_jk w_jk exp(-(z - z_j)^2 / (2 s_z^2) - (V - v_k)^2 / (2 s_V^2)),
 
@@ -30,23 +30,23 @@ class RadialBasis:
     is their spacing, with which Gaussians still follow any smooth cost. A centre above the limit makes a slope that grows towards the
     limit: its weight is the price of coming near. The cost is not convex; what the solver finds is a local solution.
 
-    soc_nodes, voltage_nodes
-        Centres from SOC 0 to 1, and over the voltage.
-    voltage_V
-        The lowest and the highest of these; None: 0.2 V below the upper voltage limit and 0.1 V above it.
-    lower, upper
-        Bounds of each weight. At 0.05 the steepest slope of one Gaussian, 0.6 w / s_V = 0.3 / V, is that of the lack of charge at SOC 0.1
-        for a cell of 2 Ah and 40 mOhm over five intervals of 10 s.
+    The default bounds of a weight: at 0.05 the steepest slope of one Gaussian, 0.6 w / s_V = 0.3 / V, is that of the lack of charge at
+    SOC 0.1 for a cell of 2 Ah and 40 mOhm over five intervals of 10 s.
 
     Source of the idea: Hirt et al., "Safe Learning-Based Optimization of Model Predictive Control: Application to Battery
     Fast-Charging", arXiv 2410.04982 (2024), 16 weights. What they are functions of, with which centres and widths, is assumed here.
     """
 
     soc_nodes: int = 4
+    """Centres of the network from SOC 0 to 1."""
     voltage_nodes: int = 4
+    """Centres over the voltage."""
     voltage_V: tuple[float, float] | None = None
+    """Lowest and highest centre; without it 0.2 V below the upper voltage limit and 0.1 V above it."""
     lower: float = -0.05
+    """Lowest value of each weight."""
     upper: float = 0.05
+    """Highest value of each weight."""
 
     def __post_init__(self) -> None:
         check_count("rbf: soc_nodes", self.soc_nodes, 2, RBF_MAX)

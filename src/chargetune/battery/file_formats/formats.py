@@ -25,13 +25,15 @@ __all__ = ["FORMATS", "Format"]
 
 # Tables of the circuit, which a cell file has in [ecm].
 CIRCUIT = re.compile(r"soc|R\d_ohm|C\d_F")
-# What a list of tables needs beside the key that is asked about.
+# What a table needs beside the key that is asked about.
 COMPLETE: dict[tuple[str, ...], dict[str, Any]] = {
     ("study", "earlier"): {"store": "earlier.sqlite", "study": "study"},
     ("theta", "observer"): {"name": "backoff_sd", "lower": 0.1, "upper": 6.0},
     ("theta", "current_ramp"): {"lower_A_s": 0.01, "upper_A_s": 0.1},
     ("theta", "temperature_backoff"): {"lower": 0.0, "upper": 5.0},
     ("theta", "anode_backoff"): {"lower": 0.0, "upper": 0.05},
+    **{("theta", name, "over"): {"temperature_K": [280.0, 310.0]} for name in ("backoff", "temperature_backoff", "anode_backoff")},
+    ("theta", "schedule"): {"age": [0.0, 1.0]},
 }
 # Two tables of one class: the margin to a limit in the limit's unit.
 BACKOFF_UNITS = {(f"{of}_backoff", name): unit for of, (_, unit) in WIDEST.items() for name in ("lower", "upper")}
@@ -98,8 +100,9 @@ def _refused_campaign(_: Cell, table: Table, key: Key, value: Any) -> str:
 
 def _document(table: Table, entries: dict[str, Any]) -> dict[str, Any]:
     inner: Any = [entries] if table.many else entries
-    for name in reversed(table.path):
-        inner = {name: inner}
+    for depth in range(len(table.path) - 1, -1, -1):
+        # A table around this one may need keys of its own.
+        inner = {**COMPLETE.get(table.path[:depth], {}), table.path[depth]: inner}
     return dict(inner)
 
 
