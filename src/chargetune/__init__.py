@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from chargetune.learning.initial_design import Sobol
     from chargetune.learning.range_of_use.range_loop import SimulatedRange
     from chargetune.learning.range_of_use.range_tuner import RangeSettings, RangeTuner
+    from chargetune.learning.range_of_use.range_twin import SimulatedRangeTwin
     from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
+    from chargetune.learning.range_twin_tuner import RangeTwinSettings, RangeTwinTuner
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.twin.settings import TwinSettings
     from chargetune.learning.twin.simulated_twin import SimulatedTwin
@@ -76,6 +78,8 @@ __all__ = [
     "RangeOfUse",
     "RangeSettings",
     "RangeTuner",
+    "RangeTwinSettings",
+    "RangeTwinTuner",
     "Safety",
     "Score",
     "ScoredLimit",
@@ -83,6 +87,7 @@ __all__ = [
     "Signal",
     "SimulatedPlant",
     "SimulatedRange",
+    "SimulatedRangeTwin",
     "SimulatedTwin",
     "Sobol",
     "SoftLimit",
@@ -137,6 +142,8 @@ _MODULES = {
     "RangeOfUse": "plants.range_of_use",
     "RangeSettings": "learning.range_of_use.range_tuner",
     "RangeTuner": "learning.range_of_use.range_tuner",
+    "RangeTwinSettings": "learning.range_twin_tuner",
+    "RangeTwinTuner": "learning.range_twin_tuner",
     "Safety": "learning.safety",
     "Score": "episode.score",
     "ScoredLimit": "episode.score_limits",
@@ -144,6 +151,7 @@ _MODULES = {
     "Signal": "model.model",
     "SimulatedPlant": "plants.simulated",
     "SimulatedRange": "learning.range_of_use.range_loop",
+    "SimulatedRangeTwin": "learning.range_of_use.range_twin",
     "SimulatedTwin": "learning.twin.simulated_twin",
     "Sobol": "learning.initial_design",
     "SoftLimit": "control.controller",

@@ -146,6 +146,7 @@ def _run(
         # Without batches more workers have something to do only if the order of the trials is given up for them; and
         # not with a tuner whose every step needs the trial before it.
         alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
+        alone = alone or config.range is not None
         at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
         workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from chargetune.learning.initial_design import Sobol
     from chargetune.learning.range_of_use.range_loop import SimulatedRange
     from chargetune.learning.range_of_use.range_tuner import RangeSettings, RangeTuner
+    from chargetune.learning.range_of_use.range_twin import SimulatedRangeTwin
     from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
+    from chargetune.learning.range_twin_tuner import RangeTwinSettings, RangeTwinTuner
     from chargetune.learning.safety import NoSafeThetaError, Safety
     from chargetune.learning.tuner import TrialLike, Tuner
     from chargetune.learning.twin.posterior import Posterior
@@ -36,8 +38,11 @@ __all__ = [
     "RangeEvaluation",
     "RangeSettings",
     "RangeTuner",
+    "RangeTwinSettings",
+    "RangeTwinTuner",
     "Safety",
     "SimulatedRange",
+    "SimulatedRangeTwin",
     "SimulatedTwin",
     "Sobol",
     "TrialLike",
@@ -59,8 +64,11 @@ _MODULES = {
     "RangeEvaluation": "range_of_use.range_verdict",
     "RangeSettings": "range_of_use.range_tuner",
     "RangeTuner": "range_of_use.range_tuner",
+    "RangeTwinSettings": "range_twin_tuner",
+    "RangeTwinTuner": "range_twin_tuner",
     "Safety": "safety",
     "SimulatedRange": "range_of_use.range_loop",
+    "SimulatedRangeTwin": "range_of_use.range_twin",
     "SimulatedTwin": "twin.simulated_twin",
     "Sobol": "initial_design",
     "TrialLike": "tuner",

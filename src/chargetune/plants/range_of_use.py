@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 from chargetune.plants.simulated import SimulatedPlant
@@ -17,15 +18,21 @@ __all__ = ["DrawnPlant", "RangeOfUse"]
 
 # Shares of a Sobol sequence are kept off 0 and 1, where a normal quantile is not finite.
 LEAST_SHARE = 1e-6
+# Halvings of the interval of shares, to the rounding of a double.
+BISECTIONS = 50
 
 
 @dataclass(frozen=True)
 class DrawnPlant:
-    """One draw: the plant, the seed of its noise, and the value of each variation by name (one entry, or one an entry)."""
+    """One draw: the plant, the seed of its noise, and the value of each variation by name (one entry, or one an entry).
+
+    ``error``: by how much its true outputs are off those of its model, as the nodes of a lookup table (outputs, nodes); None: not at all.
+    """
 
     plant: SimulatedPlant
     seed: int
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    error: NDArray[np.float64] | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -62,19 +69,47 @@ class RangeOfUse:
         if unknown:
             raise ValueError(f"range: start_bounds names unknown {unknown}, allowed are {', '.join(model.state_names)}")
 
-    def draw(self, count: int, seed: int, first: int = 0) -> list[DrawnPlant]:
-        """Draws ``first`` to ``first + count - 1`` of this seed."""
+    def draw(self, count: int, seed: int, first: int = 0, *, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
+        """Draws ``first`` to ``first + count - 1`` of this seed.
+
+        ``scores`` are normal scores of all numbers that are of the plant, in the order of the variations, a row a draw or one row for
+        all: what they stand for is not drawn. A number v has the score e with v = quantile(Phi(e)), Phi the normal distribution.
+        """
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ValueError(f"range: count = {count!r}, allowed is an integer >= 1")
         shares = self._shares(first + count, seed)[first:]
+        if scores is not None:
+            given = np.atleast_2d(np.asarray(scores, dtype=float))
+            own = int(self.of_plant.sum())
+            if given.shape not in ((count, own), (1, own)):
+                raise ValueError(f"range: scores have the shape {given.shape}, allowed is ({count}, {own}), or one row")
+            shares[:, self.of_plant] = np.clip(ndtr(given), LEAST_SHARE, 1.0 - LEAST_SHARE)
         # Noise is drawn anew for each; its seeds have spawn keys that those of a study's trials never have.
         keys = [np.random.SeedSequence(seed, spawn_key=(2, first + k)) for k in range(count)]
         seeds = [int(key.generate_state(1, np.uint64)[0]) >> 11 for key in keys]
         return [self._drawn(share, one) for share, one in zip(shares, seeds, strict=True)]
 
+    def plant_scores(self, seed: int) -> NDArray[np.float64]:
+        """Normal scores of one plant, the first draw of this seed, as `draw` takes them, shape (numbers of the plant,)."""
+        return np.asarray(ndtri(self._shares(1, seed)[0, self.of_plant]))
+
+    @property
+    def nominal_scores(self) -> NDArray[np.float64]:
+        """Scores of the plant whose numbers change nothing, v = 0, or of the nearest that a distribution has, shape (numbers,).
+
+        By bisection of each quantile function.
+        """
+        parts = [one.distribution for one, size in zip(self.variations, self.sizes, strict=True) if one.of == "plant" for _ in range(size)]
+        low, high = np.full(len(parts), LEAST_SHARE), np.full(len(parts), 1.0 - LEAST_SHARE)
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            below = np.array([float(one.at(np.array([share]))[0]) < 0 for one, share in zip(parts, middle, strict=True)], dtype=bool)
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return np.asarray(ndtri((low + high) / 2))
+
     def _shares(self, count: int, seed: int) -> NDArray[np.float64]:
         """Points of the unit cube, shape (count, numbers)."""
-        numbers = sum(self._sizes)
+        numbers = sum(self.sizes)
         if not numbers:
             return np.zeros((count, 0))
         # A Sobol sequence is balanced at powers of two; a longer one begins with the shorter.
@@ -82,17 +117,22 @@ class RangeOfUse:
         return np.asarray(np.clip(points[:count], LEAST_SHARE, 1.0 - LEAST_SHARE))
 
     @cached_property
-    def _sizes(self) -> tuple[int, ...]:
+    def sizes(self) -> tuple[int, ...]:
         """Numbers of each variation."""
         blocks = self.plant.model.parameter_blocks
         return tuple(sum(blocks[name] for name in one.parameters) if one.by_entry else 1 for one in self.variations)
+
+    @cached_property
+    def of_plant(self) -> NDArray[np.bool_]:
+        """Which of all numbers stay with a plant, shape (numbers,)."""
+        return np.repeat([one.of == "plant" for one in self.variations], self.sizes).astype(bool)
 
     def _drawn(self, shares: NDArray[np.float64], seed: int) -> DrawnPlant:
         model, sensors = self.plant.model, self.plant.sensors
         parameters = {name: np.array(values) for name, values in model.parameters}
         start = {name: float(self.plant.start.get(name, 0.0)) for name in model.state_names}
         bias, drawn = dict(sensors.bias), {}
-        for one, part in zip(self.variations, np.split(shares, np.cumsum(self._sizes, dtype=int))[:-1], strict=True):
+        for one, part in zip(self.variations, np.split(shares, np.cumsum(self.sizes, dtype=int))[:-1], strict=True):
             values = one.distribution.at(part)
             drawn[one.name] = tuple(float(v) for v in values)
             own = iter(_split(values, one, model.parameter_blocks))

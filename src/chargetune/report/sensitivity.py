@@ -116,7 +116,8 @@ def _evaluation(view: StudyView) -> Evaluate:
     """What a trial of the study was: one charge, or a theta on drawn plants."""
     if view.problem is None:
         raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
-    return evaluation_of("range" if view.over_range else "default", view.problem)
+    # Of the others only "twin" has charges in conditions of their own, where the study has a range of use.
+    return evaluation_of("range" if view.over_range else "twin" if view.tuner == "twin" else "default", view.problem)
 
 
 def rank_correlations(view: StudyView) -> dict[str, tuple[float, float]]:

@@ -72,7 +72,7 @@ def test_covariance_is_that_of_dense_algebra_with_the_spread_that_is_stated(disc
 def test_the_squares_are_those_of_all_samples():
     """|values|^2 = |e|^2 + sum of squared residuals, its gradient by finite differences; samples without a number do not count."""
     twin, episode = ToyLoop().twin, holed(Plant().episode(SPACE.upper, 3), "gauge", slice(5, 20))
-    loss = NegativeLogPosterior(twin, [(episode.input, measured(twin, episode))], np.array([NOISE]))
+    loss = NegativeLogPosterior(twin, [(twin, episode.input, measured(twin, episode))], np.array([NOISE]))
 
     def dense(e):
         left = (measured(twin, episode) - predict(twin, twin.prior_factor @ e, episode.input)) / NOISE

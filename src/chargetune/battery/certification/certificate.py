@@ -186,8 +186,13 @@ def drawn_text(problem: ChargingProblem) -> str:
     """How the values were drawn, and what of them the controller was told."""
     schedule = problem.theta.schedule
     told = ", ".join(axis.name for axis in schedule.schedule.axes) if schedule else ""
-    first = DRAWN.replace("told none of them: it reads", f"told only {told}, which choose its theta: else it reads") if told else DRAWN
-    return first if problem.plant_cell else f"{first} {DRAWN_ELECTROCHEMICAL}"
+    parts = [DRAWN.replace("told none of them: it reads", f"told only {told}, which choose its theta: else it reads") if told else DRAWN]
+    if not problem.plant_cell:
+        parts.append(DRAWN_ELECTROCHEMICAL)
+    cell = problem.range.cell if problem.range else None
+    if cell is not None:
+        parts.append(f"The plant is one cell of the range, number {cell}: what is of a cell is the same in each episode.")
+    return " ".join(parts)
 
 
 def _traces_of(path: Path) -> Path | None:

@@ -25,7 +25,7 @@ from chargetune.plants.variation import Uniform, Variation
 
 if TYPE_CHECKING:
     from chargetune.episode.compiled import CompiledEpisode
-    from chargetune.episode.episode import Episode
+    from chargetune.episode.episode import Episode, Trip
     from chargetune.episode.score import Score
 
 __all__ = ["ChargingRange", "electrochemical", "range_of_use"]
@@ -115,17 +115,20 @@ class ChargingRange:
     def largest_of(self) -> tuple[str, ...]:
         return LARGEST
 
-    def draw(self, count: int, seed: int) -> list[DrawnPlant]:
-        return self._range.draw(count, seed)
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
+        """``scores``: what is of each plant (`RangeOfUse.draw`); None: drawn too, or that of the range's one cell."""
+        return self.range_of_use.draw(count, seed, scores=self._own_scores if scores is None else scores)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         from chargetune.episode.episode import Ending
 
         return [e.noise_free() if e.ending is Ending.DONE else None for e in self.run(thetas, plants)]
 
-    def run(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode]:
-        """The episode of each theta on the plant of the same place as it was measured, however it ended."""
+    def run(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant], trips: Sequence[Trip] = ()) -> list[Episode]:
+        """The episode of each theta on the plant of the same place as it was measured, however it ended; ``trips`` end it."""
         own = [self._theta(theta, one) for theta, one in zip(thetas, plants, strict=True)]
+        if self.problem.plant_cell is not None and trips:
+            return [replace(self._loop, plant=one.plant).run(theta, one.seed, trips) for theta, one in zip(own, plants, strict=True)]
         if self.problem.plant_cell is not None:
             return self._loop.run_each(own, [one.plant for one in plants], [one.seed for one in plants])
         from chargetune.episode.stepwise import run_episode
@@ -133,7 +136,7 @@ class ChargingRange:
         controller, steps = controller_of(self.problem), self.problem.episode.steps
         control = compiled_act(controller)
         return [
-            run_episode(controller, self.plant_of(one), steps=steps, theta=theta, seed=one.seed, control=control)
+            run_episode(controller, self.plant_of(one), steps=steps, theta=theta, seed=one.seed, trips=trips, control=control)
             for theta, one in zip(own, plants, strict=True)
         ]
 
@@ -173,14 +176,20 @@ class ChargingRange:
         return charge_samples(self._exact, episode)
 
     @cached_property
-    def _range(self) -> RangeOfUse:
+    def _own_scores(self) -> NDArray[np.float64] | None:
+        """What is of the plant, where the range has one cell."""
+        cell = self.problem.range.cell if self.problem.range else None
+        return None if cell is None else self.range_of_use.plant_scores(cell)
+
+    @cached_property
+    def range_of_use(self) -> RangeOfUse:
         return range_of_use(self.problem, self.problem.range or ChargingRangeSettings())
 
     @cached_property
     def _loop(self) -> CompiledEpisode:
         from chargetune.episode.compiled import compiled_episode
 
-        return compiled_episode(controller_of(self.problem), self._range.plant, self.problem.episode.steps)
+        return compiled_episode(controller_of(self.problem), self.range_of_use.plant, self.problem.episode.steps)
 
     @cached_property
     def _exact(self) -> ChargingProblem:

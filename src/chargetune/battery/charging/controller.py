@@ -46,6 +46,8 @@ def _build(problem: ChargingProblem) -> Controller:
 
     def believed(stage: Stage) -> dict[str, Any]:
         changed = {f"{of}_ohm": stage.p[f"{of}_ohm"] * stage.theta[ratio.name(of)] for of, ratio in theta.ratios.items()}
+        if theta.capacity:
+            changed["capacity_Ah"] = stage.p["capacity_Ah"] * stage.theta["capacity_ratio"]
         return changed | {name: stage.theta[name] for name in theta.observed if name in stage.p}
 
     def most(stage: Stage) -> Any:

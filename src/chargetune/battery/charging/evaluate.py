@@ -41,8 +41,10 @@ def evaluate(problem: ChargingProblem, theta: ArrayLike | None, seed: int) -> tu
     return outcome(problem, run_charge(problem, theta, seed))
 
 
-def outcome(problem: ChargingProblem, episode: Episode) -> tuple[Score | None, Episode, str]:
+def outcome(problem: ChargingProblem, episode: Episode, *, soc_start: float | None = None) -> tuple[Score | None, Episode, str]:
     """What a study is told of a charge: (score, episode, ending); no score when the episode did not come to its end.
+
+    ``soc_start``: where the charge began, if not where the problem says.
 
     Raises KeyboardInterrupt when that is what ended it: a simulation says nothing about theta then, and can be run again.
     """
@@ -51,7 +53,7 @@ def outcome(problem: ChargingProblem, episode: Episode) -> tuple[Score | None, E
     if episode.ending is not Ending.DONE:
         return None, episode, f"{episode.ending.value}: {episode.message}"
     try:
-        return score_episode(problem, episode), episode, episode.ending.value
+        return score_episode(problem, episode, soc_start=soc_start), episode, episode.ending.value
     except NotMeasuredError as error:
         return None, episode, f"{Ending.SENSOR.value}: {error}"
 

@@ -45,6 +45,9 @@ class ChargingRangeSettings:
         Of an age a, uniform in [0, 1]: the capacity times 1 - fade a, all resistances times 1 + growth a.
     voltage_bias_V
         The voltage sensor reads too much by +- this; new in each charge.
+    cell
+        One cell of the range, by the seed that draws it: what is of the plant (resistances, capacitances, capacity, age) is the same in
+        every charge, and only what is of a charge differs. The stand-in of a real cell for the tuner "twin". None: all cells.
     draws
         Fresh draws of one trial of the tuner "range": where 0.3 % of all plants break a limit, 1000 show one with probability 0.95.
     drop_idle
@@ -63,6 +66,7 @@ class ChargingRangeSettings:
     fade: float = 0.0
     growth: float = 0.0
     voltage_bias_V: float = 0.0
+    cell: int | None = None
     draws: int = 1000
     """Fresh draws of one trial of the tuner "range"."""
     drop_idle: bool = False
@@ -79,6 +83,8 @@ class ChargingRangeSettings:
             raise ValueError(f"range: draws = {self.draws!r}, allowed is an integer in [1, {DRAWS_MAX}]")
         if not isinstance(self.drop_idle, bool):
             raise ValueError(f"range: drop_idle = {self.drop_idle!r}, allowed is true or false")
+        if self.cell is not None and (isinstance(self.cell, bool) or not isinstance(self.cell, int) or self.cell < 0):
+            raise ValueError(f"range: cell = {self.cell!r}, allowed is an integer >= 0")
         for name, least, most, unit in (("soc_start", 0.0, 1.0, ""), ("ambient_K", 200.0, 400.0, "K")):
             pair = getattr(self, name)
             if pair is None:
@@ -98,12 +104,14 @@ class ChargingRangeSettings:
     @property
     def line(self) -> str:
         """`range_line` of these entries."""
-        return range_line(self.entries)
+        return range_line(self.entries) + ("" if self.cell is None else f"; one cell of it, number {self.cell}")
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries by which plants or charges differ."""
-        return tuple(name for name, value in self.entries.items() if (value[0] < value[1] if isinstance(value, list) else value))
+        of_charge = ("soc_start", "ambient_K", "voltage_bias_V")
+        differing = self.entries if self.cell is None else {name: self.entries[name] for name in of_charge}
+        return tuple(name for name, value in differing.items() if (value[0] < value[1] if isinstance(value, list) else value))
 
 
 def range_line(entries: Mapping[str, float | Sequence[float] | None]) -> str:

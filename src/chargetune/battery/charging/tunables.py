@@ -18,7 +18,17 @@ from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.model.splines import natural_spline, piecewise_linear
 
-__all__ = ["Backoff", "CurrentLimit", "CurrentRamp", "LimitBackoff", "MeasurementSpread", "ObserverSetting", "ResistanceRatio", "Tunables"]
+__all__ = [
+    "Backoff",
+    "CapacityRatio",
+    "CurrentLimit",
+    "CurrentRamp",
+    "LimitBackoff",
+    "MeasurementSpread",
+    "ObserverSetting",
+    "ResistanceRatio",
+    "Tunables",
+]
 
 Resistance = Literal["R0", "R1", "R2", "R3"]
 RESISTANCES: tuple[Resistance, ...] = ("R0", "R1", "R2", "R3")
@@ -134,6 +144,22 @@ class ResistanceRatio:
 
 
 @dataclass(frozen=True)
+class CapacityRatio:
+    """theta in the model f: the capacity as ratio to the controller's own, log scale. A SOC that is counted is counted with it."""
+
+    lower: float = 0.5
+    upper: float = 1.5
+
+    def __post_init__(self) -> None:
+        check_number("capacity ratio: lower", self.lower, 0.1, 0.999)
+        check_number("capacity ratio: upper", self.upper, 1.001, 10.0)
+
+    @property
+    def parameter(self) -> Parameter:
+        return Parameter("capacity_ratio", self.lower, self.upper, 1.0, scale="log")
+
+
+@dataclass(frozen=True)
 class CurrentLimit:
     """theta in the set U: I <= min(I_max, c(z)), c piecewise linear on equidistant SOC nodes from 0 to 1.
 
@@ -228,8 +254,9 @@ class ObserverSetting:
 class Tunables:
     """What theta consists of, each part by its place in the controller, and values for it to simulate with.
 
-    ``R0`` to ``R3`` are resistances of the controller's model; with a ``schedule`` the parts are tables over contexts. ``values`` are of
-    theta by name, what they do not name is untuned. They are no part of what is tuned, so two that differ in nothing else are equal.
+    ``R0`` to ``R3`` are resistances of the controller's model, ``capacity`` its capacity; with a ``schedule`` the parts are tables over
+    contexts. ``values`` are of theta by name, what they do not name is untuned. They are no part of what is tuned, so two that differ in
+    nothing else are equal.
     """
 
     backoff: Backoff | None = None
@@ -242,6 +269,8 @@ class Tunables:
     """Factors on R2."""
     R3: ResistanceRatio | None = None
     """Factors on R3."""
+    capacity: CapacityRatio | None = None
+    """Factor on the capacity of the controller's model."""
     current_limit: CurrentLimit | None = None
     """Upper limit of the current over the SOC."""
     current_ramp: CurrentRamp | None = None
@@ -310,6 +339,7 @@ class Tunables:
             (
                 *([self.backoff.parameter] if self.backoff else []),
                 *(part.parameter(of, nodes) for of, part in self.ratios.items()),
+                *([self.capacity.parameter] if self.capacity else []),
                 *(part.parameter(of) for of, part in self.limit_backoffs.items()),
                 *([self.current_limit.parameter] if self.current_limit else []),
                 *([self.current_ramp.parameter(ramp_A_s)] if self.current_ramp and ramp_A_s is not None else []),

@@ -62,17 +62,31 @@ class ChargingTwin:
         belief = problem.controller_cell
         circuit = ecm_model(problem.cell, problem.controller.sampling_time_s)
         model = circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
-        anode = belief.anode is not None and problem.limits.anode_min_V is not None
-        names = ("voltage_V", *(["temperature_K"] if belief.thermal else []), *(["anode_potential_V"] if anode else []))
-        noise = {name: max(problem.sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
-        error = {name: LEAST_ERROR[name] for name in names}
+        start = start_state(belief, problem.episode.soc_start)
+        return Twin(model, tuple(unknowns), self.noise_sd, start, self.error_sd, self.error_at_rest)
+
+    @property
+    def noise_sd(self) -> dict[str, float]:
+        """Of each output that is learnt from: voltage, temperature and limited anode potential where the cell has them."""
+        cell, limits, sensors = self.problem.cell, self.problem.limits, self.problem.sensors
+        anode = cell.anode is not None and limits.anode_min_V is not None
+        names = ("voltage_V", *(["temperature_K"] if cell.thermal else []), *(["anode_potential_V"] if anode else []))
+        return {name: max(sensors.noise_sd.get(name, 0.0), LEAST_NOISE[name]) for name in names}
+
+    @property
+    def error_sd(self) -> dict[str, float]:
+        """By how much each of them is off at least where it was not measured."""
+        return {name: LEAST_ERROR[name] for name in self.noise_sd}
+
+    @property
+    def error_at_rest(self) -> float:
+        """The share of that variance without current."""
         # Of the cell's own circuit the OCV is known, and but for an unknown that is its error. Else it was identified, worst near full.
-        at_rest = OCV_SHARE if problem.plant and not self.ocv_spread_V else 0.0
-        return Twin(model, tuple(unknowns), noise, start_state(belief, problem.episode.soc_start), error, at_rest)
+        return OCV_SHARE if self.problem.plant and not self.ocv_spread_V else 0.0
 
     @property
     def features(self) -> Mapping[str, tuple[float, float]]:

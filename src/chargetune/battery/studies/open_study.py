@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.charging.range_twin import ChargingRangeTwin, RangeCharge
 from chargetune.battery.charging.soc_windows import ChargingWindows
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.battery.studies.carry_over import ChargingCarry
@@ -24,7 +25,12 @@ __all__ = ["evaluation_of", "make_tuner", "open_study"]
 
 
 def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
-    """What a trial of this tuner is: one charge, or with "range" a theta on fresh draws of the range of use."""
+    """What a trial of this tuner is: one charge, or with "range" a theta on fresh draws of the range of use.
+
+    The charge of "twin" over a range is under a condition that the trial's seed draws.
+    """
+    if name == "twin" and problem.range is not None:
+        return RangeCharge(problem)
     return _over_range(problem) if name == "range" else Evaluation(problem)
 
 
@@ -61,6 +67,14 @@ def make_tuner(
     # torch is needed from here on only.
     from chargetune import learning
 
+    start = problem.safe_start
+    first = None if start is None else tuple(float(v) for v in start)
+    safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
+    if name == "twin" and problem.range is not None:
+        of_range = ChargingRangeTwin(problem, _model_spread(problem, unknown))
+        if of_range.unpredicted:
+            raise ValueError(_unpredicted("tuner = 'twin' is given with a table [range]", of_range.unpredicted))
+        return learning.RangeTwinTuner(of_range, seed=seed, safety=safe or learning.Safety())
     known = unknown or TwinTable()
     twin = ChargingTwin(
         problem,
@@ -70,13 +84,7 @@ def make_tuner(
         ocv_spread_V=known.ocv_spread_V,
     )
     if safety and twin.unpredicted:
-        raise ValueError(
-            f"[safety] is given with the limits {', '.join(twin.unpredicted)}, which the cell's circuit does not predict: "
-            "allowed are limits whose table ([thermal], [anode]) the cell file has"
-        )
-    start = problem.safe_start
-    first = None if start is None else tuple(float(v) for v in start)
-    safe = learning.Safety(safety.probability, first, safety.budget_mVs) if safety else None
+        raise ValueError(_unpredicted("[safety] is given", twin.unpredicted))
     makers: dict[str, Callable[[int], Proposer]] = {
         "default": lambda s: learning.ConstrainedLogEI(seed=s),
         "ei": lambda s: learning.ExpectedImprovement(seed=s),
@@ -89,6 +97,25 @@ def make_tuner(
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)
+
+
+def _model_spread(problem: ChargingProblem, unknown: TwinTable | None) -> float:
+    """What the circuit is unsure of beside the range: nothing where the plant is that circuit."""
+    if problem.plant is None and unknown:
+        raise ValueError(
+            "[twin] is given with a table [range] and without [plant], allowed is one of them: the range says what is unknown of the cell"
+        )
+    for name in ("capacity_spread", "soc_spread", "ocv_spread_V"):
+        if unknown and getattr(unknown, name):
+            raise ValueError(f"twin: {name} = {getattr(unknown, name):g}, allowed is 0 with a table [range], which says that")
+    return 0.0 if problem.plant is None else (unknown or TwinTable()).resistance_spread
+
+
+def _unpredicted(what: str, limits: Sequence[str]) -> str:
+    return (
+        f"{what} with the limits {', '.join(limits)}, which the cell's circuit does not predict: "
+        "allowed are limits whose table ([thermal], [anode]) the cell file has"
+    )
 
 
 def open_study(store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False) -> Study:

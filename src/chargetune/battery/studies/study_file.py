@@ -201,6 +201,8 @@ class Config(_Table):
         for name in ("safety", "twin", "range"):
             if data[name] is None:
                 del data[name]
+        if self.range is not None and self.range.cell is None:
+            del data["range"]["cell"]
         settings = self.estimator.settings
         if isinstance(settings, (OffsetFree, Adaptive)):
             # Defaults may change; what decides the trials does not.
@@ -208,6 +210,7 @@ class Config(_Table):
         absent = (
             ("controller", "current_ramp_A_s"),
             ("theta", "observer"),
+            ("theta", "capacity"),
             ("theta", "current_ramp"),
             ("theta", "rbf"),
             ("theta", "schedule"),

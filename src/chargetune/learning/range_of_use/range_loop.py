@@ -74,8 +74,8 @@ class SimulatedRange:
     def _cases(self) -> list[Given]:
         return [self.given or {}] if self.given is None or isinstance(self.given, Mapping) else list(self.given)
 
-    def draw(self, count: int, seed: int) -> list[DrawnPlant]:
-        return self.range_of_use.draw(count, seed)
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
+        return self.range_of_use.draw(count, seed, scores=scores)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         cases = self._cases

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -33,7 +34,7 @@ class RangeSettings:
         Share of a limit's tolerance that a plant may use; the rest is for plants that were not drawn.
     first, pool
         Plants on which starts of the search are compared, the worst of the last trial if there is one, and how many Sobol points are
-        among the starts: which is clearly worse shows on a few.
+        among the starts: which is clearly worse shows on a few. Without Sobol points the search begins at the last theta alone.
     iterations, gain
         Of the search, and the share of the objective that one has to win.
     drop_idle
@@ -52,9 +53,9 @@ class RangeSettings:
 
     def __post_init__(self) -> None:
         for name in ("plants", "added", "first", "pool", "iterations"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"range settings: {name} = {value!r}, allowed is an integer >= 1")
+            value, least = getattr(self, name), int(name != "pool")
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"range settings: {name} = {value!r}, allowed is an integer >= {least}")
         for name in ("aim", "gain"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
@@ -70,7 +71,8 @@ class RangeTuner:
     (or the worst J_j) by `solve_slp`. The first theta is chosen on `RangeSettings.plants` draws, with the margin m = 0; each trial
     tries a theta on fresh draws. Those on which it was nearest to a limit join the rows, not the mean (the scenario approach with
     sampling and discarding none: Calafiore and Campi, IEEE Trans. Autom. Control 51 (2006) 742). m is by how much their worst excess
-    is above the least of theirs, in the mean: the scale of the tail, if it is exponential, beyond what was drawn. The result is the best of
+    is above the least of theirs, the median over ln 2: the scale of the tail, if it is exponential, beyond what was drawn; one plant that
+    is far out joins the rows and does not make all others careful. The result is the best of
     several trials that kept every limit, so its own draws flatter it a little: a certificate draws others.
     """
 
@@ -84,13 +86,14 @@ class RangeTuner:
         done = [t for t in trials if t.score is not None]
         common, worst = self.evaluation.loop.draw(self.settings.plants, self.seed), [self._worst(trial) for trial in done]
         tail = [one.beyond for one in worst[-1]] if done else [0.0]
-        margin = float(np.mean(tail)) - tail[-1]
+        margin = float(np.median(tail) - tail[-1]) / math.log(2.0)
         # The newest trial's worst plants come first: starts are compared on them.
         added = [one.plant for results in reversed(worst) for one in results]
         search = _RangeSearch(self.evaluation, space, common, added, margin, self.settings)
         last = space.to_unit(np.array(done[-1].theta) if done else space.default)
         # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
-        found = [search.refine(start) for start in {u.tobytes(): u for u in (last, self._start(space, search, last))}.values()]
+        starts = (last, self._start(space, search, last)) if self.settings.pool else (last,)
+        found = [search.refine(start) for start in {u.tobytes(): u for u in starts}.values()]
         theta = space.from_unit(min(found, key=search.merit_of_all))
         if self.settings.drop_idle:
             theta = without_idle(self.evaluation, space, theta, [*added, *common])

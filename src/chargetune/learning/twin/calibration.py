@@ -48,7 +48,8 @@ def check_prediction(discrepancy: Discrepancy, episode: Episode) -> PredictionCh
     the process is elsewhere.
     """
     posterior, settings, twin = discrepancy.posterior, discrepancy.settings, discrepancy.posterior.twin
-    predicted = predict(twin, posterior.mode, episode.input)
+    under = twin.under(episode)
+    predicted = predict(under, posterior.mode, episode.input)
     columns = [episode.output_names.index(name) for name in twin.noise_sd]
     filled = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
     filled.output_start[:, columns], filled.output_end[:, columns] = predicted[:, 0], predicted[:, 1]
@@ -58,7 +59,7 @@ def check_prediction(discrepancy: Discrepancy, episode: Episode) -> PredictionCh
     if not known.any():
         return PredictionCheck(np.zeros_like(SCALES), 0.0)
     noise = np.array(list(twin.noise_sd.values()))
-    own = binned_residuals(posterior.predicted_sd(episode.input) ** 2, settings.bins)[0] - posterior.discrepancy_sd**2 - noise**2
+    own = binned_residuals(posterior.predicted_sd(episode.input, under) ** 2, settings.bins)[0] - posterior.discrepancy_sd**2 - noise**2
     weights, parts = discrepancy.lookup_table.weights(discrepancy.at(episode)), discrepancy.stated
     unmodelled = np.stack([part.variances(weights, np.array([1.0, *SCALES])) for part in parts], axis=2)
     before = np.stack([part.prior_variance(weights) for part in parts], axis=1)

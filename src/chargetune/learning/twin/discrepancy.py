@@ -104,7 +104,7 @@ class Discrepancy:
         out = np.stack([np.stack(_feature(episode, name), axis=1) for name in self.features], axis=2)
         if np.all(np.isfinite(out)):
             return out
-        twin = self.posterior.twin
+        twin = self.posterior.twin.under(episode)
         predicted = dict(zip(twin.noise_sd, np.moveaxis(predict(twin, self.posterior.mode, episode.input), -1, 0), strict=True))
         for i, name in enumerate(self.features):
             seen = np.isfinite(out[..., i])
@@ -119,10 +119,9 @@ class Discrepancy:
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean residual of every bin, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
         twin, several = self.posterior.twin, unknowns.shape[:-1]
-        predicted = predict_each(twin, unknowns, [e.input for e in self.episodes])
         out = []
-        for episode, values in zip(self.episodes, predicted, strict=True):
-            seen = measured(twin, episode)
+        for episode in self.episodes:
+            (values,), seen = predict_each(twin.under(episode), unknowns, [episode.input]), measured(twin, episode)
             means = [binned_residuals(seen - own, self.settings.bins)[0] for own in values.reshape(-1, *seen.shape)]
             out.append(np.stack(means).reshape(*several, *means[0].shape))
         return np.nan_to_num(np.concatenate(out, axis=len(several)), nan=0.0)

@@ -17,17 +17,52 @@ from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.calibration import SCALES, PredictionCheck, check_prediction, scale_quantile
 from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
 from chargetune.learning.twin.laplace import fit
+from chargetune.learning.twin.posterior import Posterior
 from chargetune.learning.twin.rollout import predict_each
 from chargetune.learning.twin.settings import TwinSettings
-from chargetune.learning.twin.twin_loop import TwinLoop
+from chargetune.learning.twin.twin import Twin
+from chargetune.learning.twin.twin_loop import ModelledLoop, TwinLoop
 from chargetune.runtime.cache import Built
 
-__all__ = ["Ensemble", "Prediction", "condition", "episodes_of"]
+__all__ = ["Ensemble", "Learnt", "Prediction", "condition", "episodes_of", "learn"]
 
 # Discrepancies and checks that are kept: what was learnt from a trace is used again after the next one. Several studies may share
 # a process.
 _LEARNT: Built = Built(8, casadi=False)
 _CHECKED: Built = Built(256, casadi=False)
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What traces say of a plant: the posterior of its unknowns and what the model cannot represent; None: there is no trace yet.
+
+    ``checks`` say how well each trace but the first was predicted by those before it.
+    """
+
+    twin: Twin
+    settings: TwinSettings
+    discrepancy: Discrepancy | None
+    checks: tuple[PredictionCheck, ...] = ()
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Of the unknowns; without a trace the prior."""
+        return fit(self.twin, (), self.settings) if self.discrepancy is None else self.discrepancy.posterior
+
+    @property
+    def scale(self) -> float:
+        """The discrepancy's scale of an ensemble."""
+        return scale_quantile(self.checks, self.settings.scale_sd, self.settings.scale_share)
+
+    @property
+    def rejected(self) -> str:
+        """Why the twin is rejected as a model of this plant; empty while it may be one."""
+        # A single prediction rests on one trace, which may be far from where the next one went.
+        error = self.checks[-1].standardised_error if len(self.checks) > 1 else 0.0
+        if error >= self.settings.standardised_error_max:
+            return f"the newest trial was {error:.1f} stated standard deviations from its prediction"
+        median = scale_quantile(self.checks, self.settings.scale_sd, 0.5)
+        return f"its errors are more than {SCALES[-2]:.1f} times as large as stated" if median >= SCALES[-2] else ""
 
 
 @dataclass(frozen=True)
@@ -42,15 +77,15 @@ class Ensemble:
     discrepancy: Discrepancy | None
     checks: tuple[PredictionCheck, ...] = ()
 
+    @cached_property
+    def learnt(self) -> Learnt:
+        """What the traces say, without closed loops."""
+        return Learnt(self.loop.twin, self.settings, self.discrepancy, self.checks)
+
     @property
     def rejected(self) -> str:
         """Why the twin is rejected as a model of this plant; empty while it may be one."""
-        # A single prediction rests on one trace, which may be far from where the next one went.
-        error = self.checks[-1].standardised_error if len(self.checks) > 1 else 0.0
-        if error >= self.settings.standardised_error_max:
-            return f"the newest trial was {error:.1f} stated standard deviations from its prediction"
-        median = scale_quantile(self.checks, self.settings.scale_sd, 0.5)
-        return f"its errors are more than {SCALES[-2]:.1f} times as large as stated" if median >= SCALES[-2] else ""
+        return self.learnt.rejected
 
     def central(self, theta: NDArray[np.float64]) -> Episode | None:
         """The episode expected of theta: posterior mode and mean discrepancy."""
@@ -79,7 +114,7 @@ class Ensemble:
         twin, out = self.loop.twin, []
         columns = [episode.output_names.index(name) for name in twin.noise_sd]
         members = self._members(self.settings.plants, seed)
-        (predicted,) = predict_each(twin, np.array([m for m, _ in members]), [episode.input])
+        (predicted,) = predict_each(twin.under(episode), np.array([m for m, _ in members]), [episode.input])
         for values, (_, error) in zip(predicted, members, strict=True):
             own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
             own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
@@ -88,21 +123,17 @@ class Ensemble:
 
     @cached_property
     def _centre(self) -> tuple[NDArray[np.float64], DiscrepancySample | None]:
-        if self.discrepancy is None:
-            return fit(self.loop.twin, (), self.settings).mode, None
-        mode = self.discrepancy.posterior.mode
-        return mode, self.discrepancy.mean(mode)
+        mode = self.learnt.posterior.mode
+        return mode, None if self.discrepancy is None else self.discrepancy.mean(mode)
 
     def _members(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
         """Unknowns and discrepancy of so many plants."""
         if (count, seed) not in self._drawn:
-            posterior = self.discrepancy.posterior if self.discrepancy else fit(self.loop.twin, (), self.settings)
-            draws = posterior.draw(count, seed)
+            draws = self.learnt.posterior.draw(count, seed)
             errors: Sequence[DiscrepancySample | None] = [None] * count
             if self.discrepancy:
                 seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
-                scale = scale_quantile(self.checks, self.settings.scale_sd, self.settings.scale_share)
-                errors = self.discrepancy.samples(draws, scale, seeds)
+                errors = self.discrepancy.samples(draws, self.learnt.scale, seeds)
             self._drawn[count, seed] = list(zip(draws, errors, strict=True))
         return self._drawn[count, seed]
 
@@ -167,19 +198,25 @@ def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
 
 def condition(loop: TwinLoop, trials: Sequence[TrialLike], settings: TwinSettings | None = None) -> Ensemble:
     """What the traces of these trials leave of the plants; the prior where there is none."""
+    found = learn(loop, trials, settings)
+    return Ensemble(loop, found.settings, found.discrepancy, found.checks)
+
+
+def learn(loop: ModelledLoop, trials: Sequence[TrialLike], settings: TwinSettings | None = None) -> Learnt:
+    """What the traces of these trials say of the twin of ``loop``."""
     settings, every = settings or TwinSettings(), episodes_of(trials)
     if not every:
-        return Ensemble(loop, settings, None)
+        return Learnt(loop.twin, settings, None)
     keys = _keys(loop, settings, every)
 
     def check(k: int) -> PredictionCheck:
         return _CHECKED.get(keys[k], lambda: check_prediction(_learnt(loop, settings, every[:k], keys[:k]), every[k]))
 
     checks = tuple(check(k) for k in range(1, len(every)))
-    return Ensemble(loop, settings, _learnt(loop, settings, every, keys), checks)
+    return Learnt(loop.twin, settings, _learnt(loop, settings, every, keys), checks)
 
 
-def _learnt(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode], keys: Sequence[str]) -> Discrepancy:
+def _learnt(loop: ModelledLoop, settings: TwinSettings, episodes: Sequence[Episode], keys: Sequence[str]) -> Discrepancy:
     """The discrepancy that the newest of these episodes give; the fit begins where that of all but the last one ended."""
 
     def build() -> Discrepancy:
@@ -190,7 +227,7 @@ def _learnt(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode],
     return _LEARNT.get(keys[-1], build)
 
 
-def _keys(loop: TwinLoop, settings: TwinSettings, episodes: Sequence[Episode]) -> list[str]:
+def _keys(loop: ModelledLoop, settings: TwinSettings, episodes: Sequence[Episode]) -> list[str]:
     """A key for each of these episodes: the content of it, of all before it, of the twin and of the settings."""
     digest = hashlib.blake2b(repr((loop.twin.content, dict(loop.features), settings)).encode(), digest_size=16)
     out = []

@@ -10,6 +10,7 @@ Source: MacKay, Neural Computation 4 (1992) 448; Bock, in Modelling of Chemical 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from chargetune.episode.episode import Episode
 from chargetune.learning.twin.nested_laplace import nested_laplace
 from chargetune.learning.twin.posterior import Posterior
 from chargetune.learning.twin.residuals import binned_residuals, measured
-from chargetune.learning.twin.rollout import predict, predict_each, slopes
+from chargetune.learning.twin.rollout import predict, slopes
 from chargetune.learning.twin.settings import TwinSettings
 from chargetune.learning.twin.twin import Twin
 from chargetune.runtime.threads import parallel_map
@@ -50,10 +51,10 @@ def fit(
     are correlated count as one. ``start`` is the posterior of most of these episodes, at whose mode the search begins. Without episodes
     the result is the prior.
     """
-    settings, factor = settings or TwinSettings(), twin.prior_factor
-    data = [(e.input, measured(twin, e)) for e in episodes if len(e)]
+    settings = settings or TwinSettings()
+    data = [(twin.under(e), e.input, measured(twin, e)) for e in episodes if len(e)]
     noise = np.array(list(twin.noise_sd.values()))
-    e = np.zeros(len(factor)) if start is None else np.asarray(np.linalg.solve(factor, start.mode), dtype=np.float64)
+    e = np.zeros(twin.score_count) if start is None else start.scores[0]
     # The sd of a sample begins at the noise each time: taken over from fit to fit, mode and sd would follow each other.
     spread, unmodelled = noise, np.zeros(len(noise))
     for k in range(1 + settings.refits):
@@ -63,8 +64,7 @@ def fit(
         e = np.asarray(found.x, dtype=np.float64)
         if not (data and discrepancy):
             break
-        predicted = predict_each(twin, factor @ e, [u for u, _ in data])
-        residuals = [y - own for (_, y), own in zip(data, predicted, strict=True)]
+        residuals = [y - predict(own, twin.unknowns_at(e), u) for own, u, y in data]
         unmodelled, following = _unmodelled(residuals, noise, settings)
         # Mode, covariance and the sd of a sample belong to one fit.
         if k == settings.refits or np.allclose(following, spread, rtol=SAME):
@@ -74,8 +74,8 @@ def fit(
     curvature, directions = np.linalg.eigh(found.jac.T @ found.jac)
     root = np.asarray(directions / np.sqrt(curvature), dtype=np.float64)
     parts = nested_laplace(loss, e, root, twin.scalars) if data else []
-    components = tuple((one.share, Posterior(twin, factor @ one.mode, factor @ one.root, unmodelled, spread)) for one in parts)
-    return Posterior(twin, factor @ e, factor @ root, unmodelled, spread, components)
+    components = tuple((one.share, Posterior.of(twin, one.mode, one.root, unmodelled, spread)) for one in parts)
+    return Posterior.of(twin, e, root, unmodelled, spread, components)
 
 
 def _unmodelled(
@@ -94,20 +94,20 @@ def _unmodelled(
 
 
 class NegativeLogPosterior:
-    """|e|^2 + sum |(y - h(factor e)) / spread|^2 as the square of d + 1 numbers instead of as many as there are samples.
+    """|e|^2 + sum |(y - h(m(e))) / spread|^2 as the square of d + 1 numbers instead of as many as there are samples.
 
     With r the residuals and J their slopes, the triangle R of [J r] = Q R has the same J'J, J'r and r'r, which is all that a
     least-squares step sees. From the Cholesky factor of [J r]'[J r]: the prior keeps it far from singular.
     """
 
-    def __init__(self, twin: Twin, data: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]) -> None:
-        self._twin, self._inputs = twin, [u for u, _ in data]
+    def __init__(
+        self, twin: Twin, data: Sequence[tuple[Twin, NDArray[np.float64], NDArray[np.float64]]], spread: NDArray[np.float64]
+    ) -> None:
+        # Of each episode: the twin in its condition, and its inputs.
+        self._twin, self._under, self._inputs = twin, [own for own, _, _ in data], [u for _, u, _ in data]
         # Weight of each sample, 0 where none was measured, and the weighted measurement.
-        self._weights = [np.where(np.isfinite(y), 1.0 / spread, 0.0).ravel() for _, y in data]
-        self._wanted = [weight * np.nan_to_num(y.ravel()) for (_, y), weight in zip(data, self._weights, strict=True)]
-        d = len(twin.prior_factor)
-        self._whitened = np.eye(d + 1)
-        self._whitened[:d, :d] = twin.prior_factor
+        self._weights = [np.where(np.isfinite(y), 1.0 / spread, 0.0).ravel() for _, _, y in data]
+        self._wanted = [weight * np.nan_to_num(y.ravel()) for (_, _, y), weight in zip(data, self._weights, strict=True)]
         self._at, self._triangle = np.zeros(0), np.zeros((0, 0))
 
     def values(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,22 +121,27 @@ class NegativeLogPosterior:
     def _known(self, e: NDArray[np.float64]) -> NDArray[np.float64]:
         if not np.array_equal(e, self._at):
             own = np.hstack([np.eye(len(e)), e[:, None]])
-            squares = parallel_map(self._square, [e] * len(self._inputs), self._inputs, self._weights, self._wanted)
+            m, steep = self._twin.unknowns_at(e), self._twin.score_slopes(e)
+            whitened = np.zeros((len(m) + 1, len(e) + 1))
+            whitened[:-1, :-1], whitened[-1, -1] = steep, 1.0
+            parts = parallel_map(partial(_square, m), self._under, self._inputs, self._weights, self._wanted)
+            squares = [whitened.T @ part @ whitened for part in parts]
             total = sum(squares, start=own.T @ own)
             # Where the data fit to the last digit nothing is left of the last pivot but rounding.
             total[-1, -1] += np.finfo(float).eps * (1.0 + np.trace(total))
             self._at, self._triangle = e.copy(), np.linalg.cholesky(total).T
         return self._triangle
 
-    def _square(
-        self, e: NDArray[np.float64], inputs: NDArray[np.float64], weight: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        twin, d = self._twin, len(e)
-        m = twin.prior_factor @ e
-        both = np.empty((len(weight), d + 1))
-        both[:, :d], both[:, d] = slopes(twin, m, inputs).reshape(-1, d), predict(twin, m, inputs).ravel()
-        # What was not measured may be predicted to be no number.
-        both[weight == 0.0] = 0.0
-        both *= weight[:, None]
-        both[:, d] -= wanted
-        return np.asarray(self._whitened.T @ (both.T @ both) @ self._whitened)
+
+def _square(
+    m: NDArray[np.float64], twin: Twin, inputs: NDArray[np.float64], weight: NDArray[np.float64], wanted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """[J r]'[J r] of one episode, with the slopes J of its weighted predictions with respect to m, shape (d + 1, d + 1)."""
+    d = len(m)
+    both = np.empty((len(weight), d + 1))
+    both[:, :d], both[:, d] = slopes(twin, m, inputs).reshape(-1, d), predict(twin, m, inputs).ravel()
+    # What was not measured may be predicted to be no number.
+    both[weight == 0.0] = 0.0
+    both *= weight[:, None]
+    both[:, d] -= wanted
+    return np.asarray(both.T @ both)

@@ -24,7 +24,7 @@ from chargetune.model.given import Given, actual, checked_given
 from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
 
-__all__ = ["DISCREPANCY_SHARE", "SimulatedTwin", "TwinSimulator"]
+__all__ = ["DISCREPANCY_SHARE", "SimulatedTwin", "TwinSimulator", "default_features", "default_floor"]
 
 # Plants that are remembered: those that thetas are chosen by, and those that the chosen one is judged by.
 PLANTS_KEPT = 256
@@ -176,10 +176,8 @@ class SimulatedTwin:
 
         Raises ValueError for what the model does not have, and where there is no range for a feature.
         """
-        ranges = dict(features) if features is not None else _features(controller, limits)
-        widths = {name: high - low for name, (low, high) in (_two_sided(limits) | ranges).items()}
-        stated = {n: max(sd, DISCREPANCY_SHARE * widths[n]) if n in widths else 3.0 * sd for n, sd in noise_sd.items()}
-        floor = stated | dict(discrepancy_sd_floor or {})
+        ranges = dict(features) if features is not None else default_features(controller, limits)
+        floor = default_floor(noise_sd, limits, ranges) | dict(discrepancy_sd_floor or {})
         told = checked_given(tuple(dict.fromkeys((*controller.given_names, *plant_given))), given, steps, controller.horizon)
         followed = {name: actual([told[name]], steps).ravel().tolist() for name in plant_given}
         # What is missing in the dynamics goes on when the input is back at 0.
@@ -204,7 +202,16 @@ class SimulatedTwin:
         return sum(violation(episode, limit) / (limit.tolerance or 1.0) for limit in self.limits)
 
 
-def _features(controller: Controller, limits: Sequence[ScoredLimit]) -> dict[str, tuple[float, float]]:
+def default_floor(
+    noise_sd: Mapping[str, float], limits: Sequence[ScoredLimit], ranges: Mapping[str, tuple[float, float]] | None
+) -> dict[str, float]:
+    """By how much an output may be off, as `SimulatedTwin.build` states it."""
+    widths = {name: high - low for name, (low, high) in (_two_sided(limits) | dict(ranges or {})).items()}
+    return {n: max(sd, DISCREPANCY_SHARE * widths[n]) if n in widths else 3.0 * sd for n, sd in noise_sd.items()}
+
+
+def default_features(controller: Controller, limits: Sequence[ScoredLimit]) -> dict[str, tuple[float, float]]:
+    """Signals that a discrepancy depends on, as `SimulatedTwin.build` states it."""
     ranges = _two_sided(limits) | _input_ranges(controller)
     if not ranges:
         raise ValueError("twin: features = None, allowed is that only where an output is limited on both sides or an input is bounded")

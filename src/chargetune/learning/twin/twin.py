@@ -7,15 +7,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.episode.episode import Episode
 from chargetune.model.model import Model
 from chargetune.runtime.numeric import is_finite
 
-__all__ = ["Twin", "Uncertain"]
+__all__ = ["ScoredPrior", "Twin", "Uncertain"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,32 @@ class Uncertain:
         return self.name, self.kind if self.kind in ("start", "bias") else "block"
 
 
+class ScoredPrior(Protocol):
+    """A prior of the unknowns m as functions of scores e ~ N(0, I), where it is not the Gaussian that `Uncertain` states."""
+
+    @property
+    def size(self) -> int:
+        """Scores."""
+        ...
+
+    @property
+    def scalars(self) -> list[int]:
+        """Scores of unknowns that are one number."""
+        ...
+
+    def at(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """m of scores (..., size)."""
+        ...
+
+    def slopes(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """dm/de, shape (d, size)."""
+        ...
+
+    def under(self, twin: Twin, episode: Episode) -> Twin:
+        """The twin with the start and the parameters that this episode was under."""
+        ...
+
+
 @dataclass(frozen=True)
 class Twin:
     """A `Model` of the plant, what of it is unknown, and which outputs are measured with what noise.
@@ -57,6 +84,7 @@ class Twin:
     ``discrepancy_sd_floor`` is by how much at least an output may be off at the largest input
     where nothing was measured, however well the model fits elsewhere; its variance is proportional to the input, down to the
     share ``floor_at_zero_input`` of it: wrong resistances do no harm where nothing flows, a wrong output at rest does.
+    ``prior`` says more of the unknowns than their standard deviations, and in which condition each episode was.
     Raises ValueError for what the model does not have.
     """
 
@@ -67,6 +95,7 @@ class Twin:
     discrepancy_sd_floor: Mapping[str, float] = field(default_factory=dict)
     floor_at_zero_input: float = 0.0
     given: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    prior: ScoredPrior | None = None
 
     def __post_init__(self) -> None:
         model = self.model
@@ -111,11 +140,13 @@ class Twin:
         measured, floor = dict(self.noise_sd), dict(self.discrepancy_sd_floor)
         told = {name: list(values) for name, values in self.given.items()}
         own = (*functions, model.nominal.tolist(), self.unknowns, measured, dict(self.start), floor, self.floor_at_zero_input)
-        return (*own, told) if told else own
+        return (*own, *([told] if told else []), *([self.prior] if self.prior else []))
 
     @property
     def scalars(self) -> list[int]:
-        """Entries of the unknowns that are one number: the prior knows each apart from all others."""
+        """Entries of the scores that are one number: the prior knows each apart from all others."""
+        if self.prior is not None:
+            return self.prior.scalars
         return [int(at) for at, size in zip(np.cumsum([0, *self.sizes[:-1]]), self.sizes, strict=True) if size == 1]
 
     @cached_property
@@ -135,6 +166,23 @@ class Twin:
             out[part, part] = one.sd * np.linalg.cholesky(correlation)
             start += size
         return out
+
+    @property
+    def score_count(self) -> int:
+        """Scores e ~ N(0, I) that the unknowns follow from: m = L e with S = L L', or what ``prior`` says."""
+        return len(self.prior_factor) if self.prior is None else self.prior.size
+
+    def unknowns_at(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Unknowns m of scores e (..., score_count)."""
+        return np.asarray(scores @ self.prior_factor.T) if self.prior is None else self.prior.at(scores)
+
+    def score_slopes(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+        """dm/de at scores e, shape (d, score_count)."""
+        return self.prior_factor if self.prior is None else self.prior.slopes(scores)
+
+    def under(self, episode: Episode) -> Twin:
+        """The twin in the condition that this episode was under; itself where all episodes are under the same."""
+        return self if self.prior is None else self.prior.under(self, episode)
 
     def biases(self, m: NDArray[np.float64]) -> dict[str, float]:
         """What is added to measured outputs for unknowns m, by output."""

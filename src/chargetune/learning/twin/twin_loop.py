@@ -14,7 +14,7 @@ from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.twin import Twin
 
-__all__ = ["Member", "TracedTrial", "TwinLoop"]
+__all__ = ["Member", "ModelledLoop", "TracedTrial", "TwinLoop"]
 
 Member = tuple[NDArray[np.float64], NDArray[np.float64], DiscrepancySample | None]
 """One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
@@ -27,8 +27,8 @@ class TracedTrial(TrialLike, Protocol):
     def episode(self) -> Callable[[], Episode | None] | None: ...
 
 
-class TwinLoop(JudgedLoop, Protocol):
-    """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
+class ModelledLoop(Protocol):
+    """What is unknown of a plant, and what the error of its model depends on."""
 
     @property
     def twin(self) -> Twin: ...
@@ -40,6 +40,10 @@ class TwinLoop(JudgedLoop, Protocol):
         First the one along which it changes fastest.
         """
         ...
+
+
+class TwinLoop(JudgedLoop, ModelledLoop, Protocol):
+    """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
         """A noise-free episode of each member, None where it fails; its discrepancy is added to the measured outputs."""
