@@ -183,9 +183,11 @@ class RangeTwinTuner:
             seed = self._seed(number, k)
             rounds.append(_Round(k, tuple(float(v) for v in theta), evaluation(theta, seed)[0], seed))
 
-        def rank(one: _Round) -> tuple[float, float]:
+        def rank(one: _Round) -> tuple[int, float]:
+            """By the largest of both shares that it keeps, then by the objective; of those that keep neither by the share."""
             share, objective = _judged(one.score)
-            return min(share, self._surely), objective
+            tier = int(share >= self.safety.probability) + int(share >= self._surely)
+            return tier, objective if tier else share
 
         best = max(rounds, key=rank)
         return tuple(float(v) for v in loop.whole(np.array(best.theta))), *_judged(best.score)

@@ -9,6 +9,7 @@ import pytest
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.range_twin import ChargingRangeTwin, RangeCharge
+from chargetune.battery.charging.tunables import CapacityRatio
 from chargetune.battery.studies.open_study import evaluation_of, make_tuner
 from chargetune.battery.studies.study_file import load_config
 from chargetune.learning.range_of_use.range_twin import parameters_of
@@ -20,7 +21,8 @@ FILE = EXAMPLES / "range_learn.toml"
 
 @pytest.fixture(scope="module")
 def problem():
-    return load_config(FILE).problem()
+    found = load_config(FILE).problem()
+    return replace(found, theta=replace(found.theta, capacity=CapacityRatio()))
 
 
 def of_cell(problem, cell):

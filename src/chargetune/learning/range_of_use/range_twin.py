@@ -94,7 +94,7 @@ class SimulatedRangeTwin:
         (parameters of the plant's model by name) -> theta by name, with which the controller's model has them; None: theta holds nothing
         of the model.
 
-    Raises ValueError where nothing is of the plant, or no output has noise.
+    Raises ValueError where nothing is of the plant, no output has noise, or controller or plant have given signals.
     """
 
     range: SimulatedRange
@@ -104,6 +104,11 @@ class SimulatedRangeTwin:
     model_entries: Callable[[Mapping[str, NDArray[np.float64]]], Mapping[str, float | Sequence[float]]] | None = None
 
     def __post_init__(self) -> None:
+        told = (*self.range.controller.given_names, *self.range.range_of_use.plant.given)
+        if told:
+            raise ValueError(
+                f"range twin: given = {', '.join(dict.fromkeys(told))}, allowed is a controller and a plant without given signals"
+            )
         _ = self.twin
 
     @cached_property
