@@ -67,6 +67,7 @@ class ChargingRangeSettings:
     growth: float = 0.0
     voltage_bias_V: float = 0.0
     cell: int | None = None
+    """One cell of the range, by the seed that draws it; by default all of them."""
     draws: int = 1000
     """Fresh draws of one trial of the tuner "range"."""
     drop_idle: bool = False

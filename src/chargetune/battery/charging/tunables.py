@@ -148,11 +148,13 @@ class CapacityRatio:
     """theta in the model f: the capacity as ratio to the controller's own, log scale. A SOC that is counted is counted with it."""
 
     lower: float = 0.5
+    """Smallest factor on the controller's own capacity."""
     upper: float = 1.5
+    """Largest factor."""
 
     def __post_init__(self) -> None:
-        check_number("capacity ratio: lower", self.lower, 0.1, 0.999)
-        check_number("capacity ratio: upper", self.upper, 1.001, 10.0)
+        check_number("capacity ratio: lower", self.lower, 0.1, 0.999, "below 1, the untuned ratio")
+        check_number("capacity ratio: upper", self.upper, 1.001, 10.0, "above 1, the untuned ratio")
 
     @property
     def parameter(self) -> Parameter:
