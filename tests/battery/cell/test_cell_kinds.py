@@ -94,5 +94,5 @@ def test_the_soc_at_rest_of_a_flat_ocv_is_within_the_flat_part(voltage, soc):
     """Two equal neighbours of the table have one voltage: the first reading gives the middle between them, not a division by zero."""
     cell = KINDS["LFP 2.5 Ah"]
     assert sorted(LFP_V)[5] == sorted(LFP_V)[6]
-    found = float(_soc_at_rest({"voltage_V": voltage}, None, cell)["soc"])
+    found = float(_soc_at_rest({"voltage_V": voltage}, cell)["soc"])
     assert found == pytest.approx(soc, abs=0.06)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.evaluate import plant_of, run_charge
@@ -92,6 +93,22 @@ def test_the_voltage_at_rest_sets_the_soc(kind, start):
         **{kind: KINDS[kind](soc_from_rest=False)},
     )
     assert run_charge(told).estimate[0, 0] > start + 0.01
+
+
+@pytest.mark.parametrize("kind", ["offset_free", "adaptive"])
+def test_a_measured_soc_and_temperature_are_known_from_the_first_sample_on(kind):
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05))
+    settings = {kind: KINDS[kind](soc="measured")}
+    own = charging_problem(
+        warm, mismatch_seed=0, kind=kind, soc_start=0.2, soc_start_error=0.4, steps=5, temperature_max_K=330.0, **settings
+    )
+    plant = plant_of(own)
+    # It is warmer than the controller believes before the first sample.
+    plant = replace(plant, start={**plant.start, "temperature_K": warm.thermal.ambient_K + 12.0})
+    episode = run_episode(controller_of(own), plant, steps=5)
+    names = list(episode.estimate_names)
+    assert episode.estimate[0, names.index("soc")] == pytest.approx(0.2, abs=1e-3)
+    assert episode.estimate[0, names.index("temperature_K")] == pytest.approx(warm.thermal.ambient_K + 12.0, abs=0.1)
 
 
 def test_a_counted_soc_follows_the_controllers_own_capacity():

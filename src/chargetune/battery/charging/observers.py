@@ -191,7 +191,7 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
         process |= dict.fromkeys(overpotentials(cell), drift("overpotential_drift_V"))
         if observer.soc == "estimated":
             process["soc"], start["soc"] = drift("soc_drift"), "soc_start_sd"
-    first = partial(_soc_at_rest, cell=cell) if observer.soc_from_rest and observer.soc != "measured" else None
+    first = partial(_first_sample, cell=cell, soc_from_rest=observer.soc_from_rest, soc_measured=observer.soc == "measured")
     gate = None if observer.gate_sd is None else "gate_sd"
     return ExtendedKalman.of(
         model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, rejections_max=1, first=first
@@ -246,7 +246,13 @@ def _per_charge(p: Named, u: Named, name: str, sampling_time_s: float) -> Any:
     return p[name] * ca.sqrt(ca.fabs(_charge(u, p, sampling_time_s)))
 
 
-def _soc_at_rest(y: Mapping[str, Any], _: Named, cell: Cell) -> dict[str, Any]:
+def _first_sample(y: Mapping[str, Any], _: Named, cell: Cell, *, soc_from_rest: bool, soc_measured: bool) -> dict[str, Any]:
+    """What the first sample sets: a belief of before the charge is worth nothing where a sensor tells the same."""
+    known = {"soc": y["soc"]} if soc_measured else _soc_at_rest(y, cell) if soc_from_rest else {}
+    return known | ({"temperature_K": y["temperature_K"]} if cell.thermal else {})
+
+
+def _soc_at_rest(y: Mapping[str, Any], cell: Cell) -> dict[str, Any]:
     """The SOC whose OCV is the voltage at rest, within 0 and 1: from the inverse table by Newton steps on the table itself."""
     # Where the table is flat the voltage tells no SOC but that it is in there: its middle.
     volts = sorted(set(cell.ocv_V))
