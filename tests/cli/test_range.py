@@ -120,8 +120,9 @@ def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
     done = chargetune("compare", folder / "use.toml", "--store", folder / "use.sqlite", "--draws", 4, "--workers", 1, "--json")
     told = json.loads(done.stdout)
     rows = {row["name"]: row for row in told["rows"]}
-    wanted = ["CC-CV that keeps all limits", "nominal MPC", "best constant backoff", "tuned", "MPC that knows each plant", "plant oracle"]
-    assert list(rows) == wanted
+    wanted = ["CC-CV that keeps all limits", "nominal MPC", "nominal offset-free MPC", "best constant backoff"]
+    assert list(rows) == [*wanted, "tuned", "MPC that knows each plant", "plant oracle"]
+    assert rows["nominal offset-free MPC"]["worst_excess"]["voltage_max_V"] < rows["nominal MPC"]["worst_excess"]["voltage_max_V"]
     assert {row["draws"] for row in rows.values()} == {told["draws"]} == {4}
     assert (rows["plant oracle"]["violations"], rows["plant oracle"]["ratio"]) == (0, 1.0)
     assert told["range"]["soc_start"] == [0.3, 0.5]
