@@ -1,4 +1,4 @@
-"""Closed loops of the literature's systems, compared with IPOPT on the same expressions and, where it is written, with do-mpc.
+"""Closed loops of the literature's systems, compared with IPOPT on the same expressions and with do-mpc where it is installed.
 
     python benchmarks/generic.py [--json] [--only NAME ...] [--step-by-step]
 
@@ -11,10 +11,8 @@ import argparse
 import json
 import sys
 import time
-import warnings
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 
 from chargetune.control.ipopt_reference import ipopt_act
@@ -23,6 +21,7 @@ from chargetune.episode.stepwise import run_episode
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import mpc_systems
+from generic_do_mpc import by_do_mpc
 
 REPEATS = 3
 
@@ -45,10 +44,7 @@ def compared(case, *, step_by_step):
     set_up = time.perf_counter() - begin
     own, seconds = timed(run, REPEATS)
     other, other_seconds = timed(lambda: run_episode(case.controller, case.plant, steps=case.steps, given=case.given, control=ipopt_act), 1)
-    of_inputs, of_states = (
-        float(np.max(np.abs(one - two) / (np.ptp(two, axis=0) + 1e-12)))
-        for one, two in ((own.input, other.input), (own.state, other.state))
-    )
+    of_inputs, of_states = of_range(own.input, other.input), of_range(own.state, other.state)
     row = {
         "system": case.name,
         "hessian": case.controller.hessian,
@@ -62,12 +58,18 @@ def compared(case, *, step_by_step):
         "episode_ms": 1e3 * seconds,
         "ratio_ipopt": other_seconds / seconds,
     }
-    peer = by_do_mpc(case) if case.name == "oscillating masses" else None
+    peer = by_do_mpc(case)
     if peer is not None:
-        states, peer_seconds = peer
-        row["state_difference_do_mpc"] = float(np.max(np.abs(own.state - states) / np.ptp(states, axis=0)))
+        states, inputs, peer_seconds = peer
+        row["input_difference_do_mpc"] = of_range(own.input, inputs)
+        row["state_difference_do_mpc"] = of_range(own.state, states)
         row["ratio_do_mpc"] = peer_seconds / seconds
     return row
+
+
+def of_range(one, two):
+    """The largest difference as a share of the second one's range, over all columns."""
+    return float(np.max(np.abs(one - two) / (np.ptp(two, axis=0) + 1e-12)))
 
 
 def timed(run, repeats):
@@ -78,37 +80,6 @@ def timed(run, repeats):
         result = run()
         times.append(time.perf_counter() - begin)
     return result, min(times)
-
-
-def by_do_mpc(case):
-    """(states, seconds) of the oscillating masses by do-mpc; None where it is not installed."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import do_mpc
-    except ImportError:
-        return None
-    own = case.controller.model
-    model = do_mpc.model.Model("discrete", "SX")
-    state, u = model.set_variable("_x", "x", shape=(4, 1)), model.set_variable("_u", "u")
-    model.set_rhs("x", own.f(state, u, []))
-    model.setup()
-    mpc = do_mpc.controller.MPC(model)
-    quiet = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes"}
-    mpc.set_param(n_horizon=case.controller.horizon, t_step=own.sampling_time_s, store_full_solution=False, nlpsol_opts=quiet)
-    mpc.set_objective(lterm=ca.sumsqr(model.x["x"]), mterm=ca.sumsqr(model.x["x"]))
-    mpc.set_rterm(u=1e-4)
-    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = -0.5, 0.5
-    mpc.bounds["lower", "_x", "x"], mpc.bounds["upper", "_x", "x"] = -4.0, 4.0
-    mpc.setup()
-    x = case.plant.start_state
-    mpc.x0 = x
-    mpc.set_initial_guess()
-    states, begin = [x], time.perf_counter()
-    for _ in range(case.steps):
-        x = np.array(own.f(x, mpc.make_step(x.reshape(-1, 1)), [])).ravel()
-        states.append(x)
-    return np.array(states), time.perf_counter() - begin
 
 
 def main():
@@ -128,7 +99,13 @@ def main():
                 "not solved {unsolved_percent:.0f} %, set-up {set_up_s:.0f} s, {episode_ms:.1f} ms, {ratio_ipopt:.0f} x IPOPT".format(
                     **rows[-1]
                 )
-                + (f", {rows[-1]['ratio_do_mpc']:.0f} x do-mpc" if "ratio_do_mpc" in rows[-1] else ""),
+                + (
+                    "; do-mpc: inputs {input_difference_do_mpc:.1e}, states {state_difference_do_mpc:.1e}, {ratio_do_mpc:.0f} x".format(
+                        **rows[-1]
+                    )
+                    if "ratio_do_mpc" in rows[-1]
+                    else ""
+                ),
                 flush=True,
             )
     if asked.json:

@@ -32,8 +32,24 @@ def study(tmp_path):
 def test_check_is_silent_on_an_example(chargetune_here, tmp_path):
     code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml", "--json", "--figures", tmp_path / "f")
     assert code == 0
-    assert json.loads(out) == {"file": str(EXAMPLES / "reference_model.toml"), "findings": [], "figures": []}
-    assert "nothing found" in chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
+    told = json.loads(out)
+    assert told == {"file": str(EXAMPLES / "reference_model.toml"), "findings": [], "figures": [], "note": told["note"]}
+    text = chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
+    assert "nothing found" in text
+    assert f"note: {told['note']}\n" in text
+
+
+@pytest.mark.parametrize(("kind", "read"), [("open_loop", False), ("exact", False), ("kalman", True), ("offset_free", True)])
+def test_check_says_that_a_measured_voltage_is_not_read(chargetune_here, tmp_path, kind, read):
+    path = tmp_path / "s.toml"
+    path.write_text(study_text(episode={"steps": 60, "soc_start": 0.4, "soc_target": 0.7}) + f'[estimator]\nkind = "{kind}"\n')
+    _, out, _ = chargetune_here("check", path, "--json")
+    note = json.loads(out)["note"]
+    if read:
+        assert note is None
+    else:
+        assert f"estimator.kind = '{kind}' does not read it" in note
+        assert "kind = 'offset_free' or 'adaptive' reads it" in note
 
 
 def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune_here, study, tmp_path):

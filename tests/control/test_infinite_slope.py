@@ -47,11 +47,12 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.parametrize("hessian", ["gauss_newton", "exact"])
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_a_root_at_the_start_is_solved(name):
+def test_a_root_at_the_start_is_solved(name, hessian):
     """dT/du or dT/dT is infinite at T = u = 0; the plan is that of a search without derivatives of the model."""
     following, changes = SYSTEMS[name]
-    controller, plant = build(following, **changes)
+    controller, plant = build(following, hessian=hessian, **changes)
     episode = ct.simulate(controller, plant, steps=4)
     assert episode.failures == 0
     held = controller.input_blocks

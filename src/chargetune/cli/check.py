@@ -45,9 +45,12 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
 
         drawn = save_findings(findings, figures)
     if as_json:
-        print(json.dumps({"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}))  # noqa: T201
+        found = {"findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}
+        print(json.dumps({"file": str(path), **found, "note": problem.estimator.unread}))  # noqa: T201
     else:
         print_findings(findings, screen)
+        if problem.estimator.unread:
+            screen.print(f"note: {problem.estimator.unread}", markup=False, soft_wrap=True)
         screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)
     if any(f.severity == "error" for f in findings):
         sys.exit(1)

@@ -122,10 +122,10 @@ def _over_range(
         print(json.dumps({"range": use, "draws": draws, "rows": facts, "result": None if result is None else result.facts()}))  # noqa: T201
         return
     screen, table = console(), Table(box=None, pad_edge=False)
-    # At 80 columns a heading needs lines of its own.
+    # At 80 columns a heading needs lines of its own. Where that is not enough names are wrapped, and no number is cut.
     excesses = [f"worst\n{limit.replace('_', chr(10), 1)}" for limit in limits]
-    for heading in ("", "chosen", "over a\nlimit", *excesses, "mean\nt80 min", "mean\nt90 min", "t80 to\noracle's"):
-        table.add_column(heading, justify="left" if heading in ("", "chosen") else "right", no_wrap=True)
+    for heading in ("", "chosen", "over a\nlimit", *excesses, "mean\nt80\nmin", "mean\nt90\nmin", "t80 to\noracle's"):
+        table.add_column(heading, justify="left" if heading in ("", "chosen") else "right", no_wrap=heading != "")
     for one in facts:
         worst = (_excess(limit, one["worst_excess"][limit]) for limit in limits)
         times = (number(one["mean_t80_min"]), number(one["mean_t90_min"]), number(one["ratio"], 3))
@@ -196,7 +196,7 @@ def _extreme(row: Row, signal: str, *, largest: bool, factor: float) -> float | 
 def _table(rows: list[Row]) -> Table:
     table = Table(box=None, pad_edge=False)
     for heading in ("", "chosen", "t80\nmin", "t90\nmin", "over\nmV", "anode\nmV", "max\nK", "limits"):
-        table.add_column(heading, justify="left" if heading in ("", "chosen", "limits") else "right", no_wrap=True)
+        table.add_column(heading, justify="left" if heading in ("", "chosen", "limits") else "right", no_wrap=heading != "")
     for row in rows:
         facts = _facts(row)
         excess = facts["worst_excess"]

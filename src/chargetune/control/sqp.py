@@ -34,9 +34,9 @@ HALVINGS_MAX = 6
 # Iterations from this one on take the curvature of constraints and dynamics into account. Gauss-Newton steps are cheaper and
 # mostly converge in one or two; along a limit that is bent in the input, as that of a temperature is, they go back and forth.
 CURVED_FROM = 2
-# A first iterate at which a derivative is infinite, as that of a root at an input's bound, moves in by this share of the input's range, as
-# IPOPT's bound_push does.
-INSIDE = 1e-2
+# A first iterate at which a derivative is infinite, as that of a root at an input's bound, moves in by the first share of the range of the
+# input, as IPOPT's bound_push does. Where states still leave the domain, as a tank that runs empty does, it begins in the middle.
+INSIDE = (1e-2, 0.5)
 # Violations of this share of a limit's scale come from the QP solver's own tolerance.
 MERIT_ROUNDING = 1e-9
 
@@ -98,15 +98,17 @@ def _begin(problem: Problem) -> ca.Function:
     arguments = [ca.MX.sym(name, rows) for name, rows in (*names, ("lower", problem.size), ("upper", problem.size))]
     now, known, inputs, lower, upper = arguments
     q = ca.MX.sym("q", problem.sweep.size1_in(2))
-    there = problem.sweep(now, inputs, q)
-    room = INSIDE * span_of(lower, upper)
-    moved = problem.clip(known, ca.fmin(ca.fmax(inputs, lower + room), upper - room), q)
-    kept = [ca.MX.sym("kept", *part.shape) for part in (inputs, *there)]
-    stay = ca.Function("stay", [*arguments, q, *kept], kept)
-    inside = ca.Function("inside", [*arguments, q, *kept], [moved, *problem.sweep(now, moved, q)])
-    branch = ca.Function.if_else("where", inside, stay)
-    lost = ca.logic_not(finite(ca.sum1(ca.fabs(there[2]))))
-    return ca.Function("begin", [*arguments, q], list(branch(lost, *arguments, q, inputs, *there)))
+    there = [inputs, *problem.sweep(now, inputs, q)]
+    for share in INSIDE:
+        room = share * span_of(lower, upper)
+        moved = problem.clip(known, ca.fmin(ca.fmax(inputs, lower + room), upper - room), q)
+        kept = [ca.MX.sym("kept", *part.shape) for part in there]
+        stay = ca.Function("stay", [*arguments, q, *kept], kept)
+        inside = ca.Function("inside", [*arguments, q, *kept], [moved, *problem.sweep(now, moved, q)])
+        branch = ca.Function.if_else("where", inside, stay)
+        lost = ca.logic_not(finite(ca.sum1(ca.fabs(there[-1]))))
+        there = list(branch(lost, *arguments, q, *there))
+    return ca.Function("begin", [*arguments, q], there)
 
 
 def cold(problem: Problem, inputs: NDArray[np.float64]) -> NDArray[np.float64]:

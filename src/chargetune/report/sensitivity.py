@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 
+from chargetune.battery.charging.problem import with_feedback
 from chargetune.battery.studies.open_study import evaluation_of
+from chargetune.episode.score import Score
 from chargetune.report.figures.convergence import worst_excess
 from chargetune.report.study_view import StudyView
 from chargetune.study.evaluation import Evaluate
 from chargetune.study.trial import Trial
 
-__all__ = ["STEP", "Importance", "Sensitivity", "again", "finite_differences", "importance", "rank_correlations"]
+__all__ = ["STEP", "Importance", "Sensitivity", "again", "finite_differences", "importance", "rank_correlations", "with_observer"]
 
 # Share of an entry's range (logarithmic for a log scale) by which it is moved.
 STEP = 0.02
@@ -110,6 +112,18 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
         down, up = changes
         out.append(Sensitivity(entry, (down[0], up[0]), (down[1], up[1]), (down[2], up[2])))
     return out
+
+
+def with_observer(view: StudyView, trial: Trial) -> Score | None:
+    """The untuned controller with the observer that reads the voltage (`with_feedback`), as a trial with the seed of ``trial``.
+
+    None where the study's own controller has one, where it is not one of battery charging, and where the charge has no score.
+    """
+    problem = view.problem
+    if problem is None or problem.estimator.follows_offset:
+        return None
+    evaluate = evaluation_of("range" if view.over_range else "default", with_feedback(problem))
+    return evaluate(np.zeros(0), trial.seed)[0]
 
 
 def _evaluation(view: StudyView) -> Evaluate:

@@ -181,7 +181,10 @@ def read_studies(store: str | os.PathLike[str], only: int | None = None) -> list
 def _view(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyView:
     config = record.identity["config"]
     tuner = str(config.get("study", {}).get("tuner", ""))
-    problem = problem_of_document(config) if "cell" in config else None
+    try:
+        problem = problem_of_document(config) if "cell" in config else None
+    except ValueError as error:
+        raise ValueError(f"study {record.name!r}: {error}") from error
     return StudyView(
         location=store.location,
         name=record.name,

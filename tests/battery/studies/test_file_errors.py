@@ -19,6 +19,15 @@ from chargetune.battery.studies.study_file import Config, load_config, read_tabl
         ("[theta.backoff]\nnode = 5", "theta.backoff.node is not a known key; did you mean nodes?"),
         ("[estimator.kalman]\nxyzzy = 5", "estimator.kalman.xyzzy is not a known key; known in [estimator.kalman] are "),
         ("[[study.earlier]]\nstore = 'a'\nstudi = 'b'", "study.earlier[0].studi is not a known key; did you mean study?"),
+        (
+            "[estimator.offset_free]\nresistance_rate = 2.0",
+            "estimator.offset_free.resistance_rate = 2.0 is no key any more; resistance_drift replaced it",
+        ),
+        (
+            "[estimator]\nkind = 'offset_free'\n[[theta.observer]]\nname = 'resistance_rate'\nlower = 0.5\nupper = 5.0",
+            "theta.observer names 'resistance_rate', which is no number of the estimator any more; resistance_drift replaced it",
+        ),
+        ("[estimator]\noffset_free = 3", "estimator.offset_free = 3, allowed is a table [estimator.offset_free] with "),
         ("[controller]\nhorizon = 5.5", "controller.horizon = 5.5, allowed is a whole number"),
         ("[controller]\nsampling_time_s = true", "controller.sampling_time_s = true, allowed is a number"),
         ("[study]\nname = 3", "study.name = 3, allowed is text in quotes"),

@@ -159,3 +159,16 @@ def test_a_file_without_anything_is_the_default_problem():
     problem = Config().problem()
     assert (problem.current_max_A, problem.voltage_max_V, problem.voltage_min_V) == (6.0, 4.2, 2.5)
     assert (problem.plant, problem.safety, problem.controller.mismatch_seed) == (None, None, None)
+
+
+def test_a_stored_number_that_another_replaced_is_refused_with_what_did():
+    """Its value says nothing about the other's, so that the stored trials are not those of today's controller."""
+    document = json.loads(json.dumps(load_config(EXAMPLES / "offset_free.toml").document(EXAMPLES)))
+    assert problem_of_document(document).estimator.kind == "offset_free"
+    settings = document["estimator"]["offset_free"]
+    settings["resistance_rate"] = 2.0
+    del settings["resistance_drift"]
+    with pytest.raises(
+        ValueError, match=r"^estimator\.offset_free\.resistance_rate = 2\.0 is no key any more; resistance_drift replaced it"
+    ):
+        problem_of_document(document)

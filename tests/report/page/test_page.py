@@ -12,6 +12,8 @@ import pytest
 from html_check import parsed
 from report_studies import HOSTILE, charging, other_study, run_charging
 
+from chargetune.battery.charging.evaluate import evaluate
+from chargetune.battery.charging.problem import with_feedback
 from chargetune.report import read_study, report_page
 from chargetune.report.page.html import table
 
@@ -72,6 +74,18 @@ def test_text_says_what_the_store_says(page, stores):
     assert "limit trip: too hot" in text
     # The run is deterministic, so evaluating again gives the same to rounding.
     assert float(re.search(r"largest difference([\d.e+-]+)", text)[1]) < 1e-9
+
+
+def test_untuned_controller_with_feedback_stands_beside_the_result(page, stores):
+    view = read_study(stores["mixed"], "charge")
+    score, _, _ = evaluate(with_feedback(view.problem), None, view.tuned.seed)
+    text = sections(parsed(page))
+    assert "untuned, offset_free" in text
+    assert "What it already does is no merit of learning" in text
+    # One that reads the voltage overshoots less than the wrong model alone.
+    assert score.metrics["overshoot_mV"] < view.start.score.metrics["overshoot_mV"]
+    assert f"{score.metrics['overshoot_mV']:.4g}" in text
+    assert "untuned, offset_free" not in report_page(view, evaluate=False)
 
 
 def test_hundred_trials_fit_in_5_MB(tmp_path):

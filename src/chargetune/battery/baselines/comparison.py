@@ -20,12 +20,14 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
 __all__ = [
-    "CCCV", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "plant_oracle", "row_names",
+    "CCCV", "FEEDBACK", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "plant_oracle", "row_names",
     "smallest_that_keeps",
 ]  # fmt: skip
 
 # CC-CV at the fastest rate with which every limit is kept.
 CCCV = "CC-CV that keeps all limits"
+# The controller that reads the voltage, before it has learnt anything: what it does is no merit of learning.
+FEEDBACK = "nominal offset-free MPC"
 # That rate is found to this share of the largest current.
 RATE_TOLERANCE = 1 / 64
 
@@ -76,8 +78,8 @@ def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[s
     if as_steppable(plant_of(problem)) is None:
         names = []
     names += ["nominal MPC"]
-    if problem.estimator.kind not in ("offset_free", "adaptive"):
-        names.append("nominal offset-free MPC")
+    if not problem.estimator.follows_offset:
+        names.append(FEEDBACK)
     names.append("best constant backoff")
     if problem.plant_cell is not None:
         names.append("MPC with the true model")
@@ -133,7 +135,7 @@ def _row(problem: ChargingProblem, name: str, theta: Sequence[float] | None, see
             problem, name, four_step([s * largest for s in ATTIA_RATES], min(largest, problem.cell.capacity_Ah)), voltage
         ),
         "plant oracle": lambda: _stepped(problem, name, constant_current(largest), list(problem.limits_by_name.values())),
-        "nominal offset-free MPC": lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
+        FEEDBACK: lambda: _judged(plain, name, run_charge(with_feedback(plain), None, seed)),
         "nominal MPC": lambda: _judged(problem, name, run_charge(problem, problem.space.default, seed)),
         "best constant backoff": lambda: _best_backoff(plain, name, seed),
         "MPC with the true model": lambda: _judged(plain, name, run_charge(knowing_the_plant(plain), None, seed)),

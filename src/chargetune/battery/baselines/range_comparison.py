@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
-from chargetune.battery.baselines.comparison import CCCV, chosen_rows, constant_backoff, largest_share, smallest_that_keeps
+from chargetune.battery.baselines.comparison import CCCV, FEEDBACK, chosen_rows, constant_backoff, largest_share, smallest_that_keeps
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.limits import Limit
-from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant
+from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant, with_feedback
 from chargetune.battery.charging.tunables import Tunables
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.compiled import compiled_episode
@@ -63,7 +63,8 @@ class RangeRow:
 
 def range_row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
     """What can be compared over the range, in the order of the table."""
-    names = [CCCV, "nominal MPC", "best constant backoff", *(["tuned"] if theta is not None else [])]
+    feedback = [] if problem.estimator.follows_offset else [FEEDBACK]
+    names = [CCCV, "nominal MPC", *feedback, "best constant backoff", *(["tuned"] if theta is not None else [])]
     return [*names, *(["MPC that knows each plant"] if problem.plant_cell else []), ORACLE]
 
 
@@ -117,6 +118,7 @@ class _Drawn:
         table: dict[str, Callable[[], RangeRow]] = {
             CCCV: lambda: self._fastest(name),
             "nominal MPC": lambda: self._controlled(name, problem, problem.space.default),
+            FEEDBACK: lambda: self._controlled(name, with_feedback(problem), []),
             "best constant backoff": lambda: self._backoff(name, plain),
             "tuned": lambda: self._controlled(name, problem, np.array(theta)),
             "MPC that knows each plant": lambda: RangeRow(

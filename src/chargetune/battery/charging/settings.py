@@ -104,6 +104,21 @@ class EstimatorSettings:
         return f"{self.kind}: {reads[self.kind or 'open_loop']}"
 
     @property
+    def follows_offset(self) -> bool:
+        """Whether a lasting error of the voltage is followed, so that it does not stay beyond a limit."""
+        return self.kind in ("offset_free", "adaptive")
+
+    @property
+    def unread(self) -> str | None:
+        """What is left unread although it is measured, and what reads it, one line; None where the voltage is read."""
+        if self.settings is not None:
+            return None
+        return (
+            f"the voltage is measured, and estimator.kind = '{self.kind}' does not read it: wrong resistances become overshoot; "
+            "kind = 'offset_free' or 'adaptive' reads it"
+        )
+
+    @property
     def settings(self) -> Kalman | OffsetFree | Adaptive | None:
         """The settings of the filter; None where there is none."""
         match self.kind:

@@ -260,6 +260,9 @@ OTHER_FILES = {
     "study": ("Config", "a study file, which `chargetune tune` takes; a campaign names it in [campaign], configs = [...]"),
 }
 
+# Numbers of `OffsetFree` in older files and stores, and what to write instead: 2 acted at 10 s and the largest current as 0.15 does.
+REPLACED = {"resistance_rate": "resistance_drift replaced it, a random walk over the SOC that holds for every sampling time (default 0.15)"}
+
 # What older files and stores call the kind of the estimator.
 OVERPOTENTIAL = {"model": "open_loop", "exact": "exact"}
 
@@ -278,6 +281,7 @@ def _as_recorded(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _migrated(data: dict[str, Any]) -> dict[str, Any]:
     """Tables of an older file or store with ``estimator.kind`` instead of ``controller.overpotential`` and a table [estimator.kalman]."""
+    _check_replaced(data)
     controller, estimator = data.get("controller"), data.get("estimator", {})
     if not isinstance(estimator, dict):
         return data
@@ -291,6 +295,19 @@ def _migrated(data: dict[str, Any]) -> dict[str, Any]:
     kind = "kalman" if estimator.get("kalman") is not None else OVERPOTENTIAL[old]
     rest = {name: value for name, value in controller.items() if name != "overpotential"}
     return data | {"controller": rest, "estimator": {"kind": kind, **estimator}}
+
+
+def _check_replaced(data: Mapping[str, Any]) -> None:
+    """Refuse what another key with another meaning took the place of: its value says nothing about that one's."""
+    observer, theta = (data.get(name) for name in ("estimator", "theta"))
+    settings = observer.get("offset_free") if isinstance(observer, Mapping) else None
+    tuned = theta.get("observer") if isinstance(theta, Mapping) else None
+    names = [part.get("name") for part in tuned if isinstance(part, Mapping)] if isinstance(tuned, list) else []
+    for old, new in REPLACED.items():
+        if isinstance(settings, Mapping) and old in settings:
+            raise ValueError(f"estimator.offset_free.{old} = {settings[old]!r} is no key any more; {new}")
+        if old in names:
+            raise ValueError(f"theta.observer names {old!r}, which is no number of the estimator any more; {new}")
 
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from chargetune.battery.baselines.comparison import Row
+from chargetune.battery.baselines.comparison import FEEDBACK, Row
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.report.figures.style import BLUE, GREEN, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, letter, new_figure
 from chargetune.report.figures.trajectories import LABELS, curves, panel_names
@@ -18,6 +18,7 @@ __all__ = ["comparison_figure"]
 COLOURS = {
     "plant oracle": GREEN,
     "nominal MPC": BLUE,
+    FEEDBACK: "#000000",
     "tuned": ORANGE,
     "MPC with the true model": "#56B4E9",
     "best constant backoff": "#CC79A7",

@@ -15,7 +15,7 @@ from chargetune.report.page.html import packed, plotly_js, section, static
 from chargetune.report.page.plot_data import rounded, trial_drawing
 from chargetune.report.page.trial_rows import study_head, trial_rows
 from chargetune.report.safety import predicted_probabilities
-from chargetune.report.sensitivity import STEP, Importance, Sensitivity, finite_differences, importance
+from chargetune.report.sensitivity import STEP, Importance, Sensitivity, finite_differences, importance, with_observer
 from chargetune.report.study_view import StudyView
 from chargetune.report.words import objective_of_study
 
@@ -39,16 +39,17 @@ def report_page(
 ) -> str:
     """The page as HTML.
 
-    ``evaluate`` runs the best theta again, its neighbours, and theta with each entry put back, on the simulated plant; ``progress`` is
-    called after each of these `evaluations`. It is done only where the plant is a circuit, which takes milliseconds an
-    episode. With it a safe study's twin is asked again what it promised. ``others`` are further studies of the store to compare with,
-    ``certified`` is the study's certificate (`certificate_of`).
+    ``evaluate`` runs the best theta again, its neighbours, theta with each entry put back, and the untuned controller with an observer
+    on the simulated plant; ``progress`` is called after each of the `evaluations` of theta. It is done only where the plant is a circuit,
+    which takes milliseconds an episode. With it a safe study's twin is asked again what it promised. ``others`` are further studies of the
+    store to compare with, ``certified`` is the study's certificate (`certificate_of`).
     """
     best, start = view.tuned, view.start
     quick = evaluate and view.problem is not None and view.problem.plant_cell is not None and best is not None
     # On a thousand drawn plants an evaluation takes seconds: there each entry is put back, and not moved to its neighbours.
     moved = finite_differences(view, best, progress) if quick and best is not None and not view.over_range else []
     put_back = importance(view, best, progress) if quick and best is not None else []
+    feedback = with_observer(view, best) if quick and best is not None else None
     promised = predicted_probabilities(view) if evaluate else []
     names = [(view.start_label, start, "untuned", "")]
     if best is not None:
@@ -79,7 +80,7 @@ def report_page(
         sections.opening(view)
         + _figures("Signals over time", "signals", '<div class="legend" id="legend"></div>\n', there=any(d["panels"] for d in every))
         + section("Convergence", '<div class="figures large" id="convergence"></div>\n')
-        + sections.result(view)
+        + sections.result(view, feedback)
         + sections.limits(view)
         + evidence.promises(view, promised)
         + evidence.certificate(view, certified)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from html import escape
 
 from chargetune.battery.charging.wording import metric_words
+from chargetune.episode.score import Score
 from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
 from chargetune.report.page.html import Cell, beside, paragraph, section, table
@@ -124,7 +125,8 @@ def _told(value: float | None, unit: str) -> str:
     return "differs by trial" if value is None else f"{value:.4g} {unit}".rstrip()
 
 
-def result(view: StudyView) -> str:
+def result(view: StudyView, feedback: Score | None = None) -> str:
+    """theta and figures of merit of the result beside the start, and the ``feedback`` of an observer that needed no trial."""
     best, start = view.tuned, view.start
     if best is None:
         return ""
@@ -134,15 +136,20 @@ def result(view: StudyView) -> str:
         at = "at its bound" if min(value - x["lower"], x["upper"] - value) <= 1e-6 * span else ""
         rows.append((x["entry"], value, x["untuned"], x["unit"], x["lower"], x["upper"], at))
     headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower", "upper", "")
-    scores = [t.score if t is not None else None for t in (start, best)]
+    scores = [start.score if start is not None else None, *([feedback] if feedback is not None else []), best.score]
     names = dict.fromkeys(name for score in scores if score is not None for name in score.metrics)
     figures: list[tuple[Cell, ...]] = []
     for name in names:
         label, unit = metric_words(name)
         figures.append((label, *(None if score is None else score.metrics.get(name) for score in scores), (unit, "text")))
     what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
-    merit = table(("figure of merit", view.start_label, f"trial {best.number}", ("unit", "text")), figures)
-    return section(what, beside(table(headings, rows), merit))
+    other = ["untuned, offset_free"] if feedback is not None else []
+    merit = table(("figure of merit", view.start_label, *other, f"trial {best.number}", ("unit", "text")), figures)
+    aside = (
+        "untuned, offset_free: the controller with an observer that reads the voltage (estimator.kind), with its defaults and no theta, "
+        f"run for this page with the seed of trial {best.number}. What it already does is no merit of learning."
+    )
+    return section(what, beside(table(headings, rows), merit), paragraph(aside, "faint") if other else "")
 
 
 def limits(view: StudyView) -> str:
