@@ -151,12 +151,15 @@ const Figures = (() => {
         });
       });
     }
-    const failed = rows.filter((row) => row.status === "failed");
-    if (failed.length) {
-      data.push({
-        x: failed.map((row) => row.number), y: failed.map(() => 0.04), text: failed.map((row) => row.ending), name: "failed", yaxis: "y99",
-        mode: "markers", marker: { color: colour("ink"), symbol: "x-thin-open", size: 8 }, hovertemplate: "trial %{x} failed<extra></extra>",
-      });
+    // Without a value the mark stands at the foot of the axis.
+    for (const [status, name, symbol] of [["failed", "failed", "x-thin-open"], ["apart", "set apart", "line-ns-open"]]) {
+      const without = rows.filter((row) => row.status === status);
+      if (without.length) {
+        data.push({
+          x: without.map((row) => row.number), y: without.map(() => 0.04), name, yaxis: "y99", mode: "markers",
+          marker: { color: colour("ink"), symbol, size: 8 }, hovertemplate: `trial %{x} ${name}<extra></extra>`,
+        });
+      }
     }
     data.push({
       x: rows.map((row) => row.number), y: incumbents(rows, head.objective.larger), name: "best so far", mode: "lines", hoverinfo: "skip",

@@ -14,7 +14,7 @@ const Trials = (where, rows, choose) => {
   const verdict = (row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken");
   const kinds = {
     all: () => true, kept: (row) => row.feasible === true, "over a limit": (row) => row.feasible === false,
-    failed: (row) => row.status === "failed", running: (row) => row.status === "running", result: (row) => row.number === best,
+    failed: (row) => row.status === "failed", "set apart": (row) => row.status === "apart", running: (row) => row.status === "running", result: (row) => row.number === best,
   };
 
   // The tools above the table: which trials, and whether theta stands in it.
