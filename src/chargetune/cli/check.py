@@ -14,7 +14,7 @@ from rich.console import Console
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.studies.study_file import load_config
 from chargetune.checks.finding import Finding
-from chargetune.cli.output import console
+from chargetune.cli.output import console, setting
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.runtime.interrupts import raise_lost_interrupt
 
@@ -45,8 +45,11 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
 
         drawn = save_findings(findings, figures)
     if as_json:
-        print(json.dumps({"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}))  # noqa: T201
+        found = {"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}
+        print(json.dumps(found | setting(problem)))  # noqa: T201
     else:
+        for line in problem.setting_lines:
+            screen.print(line, markup=False, style="dim", soft_wrap=True)
         print_findings(findings, screen)
         screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)
     if any(f.severity == "error" for f in findings):
