@@ -30,10 +30,18 @@ def study(tmp_path):
 
 
 def test_check_is_silent_on_an_example(chargetune_here, tmp_path):
-    code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml", "--json", "--figures", tmp_path / "f")
+    code, out, _ = chargetune_here("check", EXAMPLES / "reference_backoff.toml", "--json", "--figures", tmp_path / "f")
     assert code == 0
-    assert json.loads(out) == {"file": str(EXAMPLES / "reference_model.toml"), "findings": [], "figures": []}
-    assert "nothing found" in chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
+    setting = {"plant": "its own circuit, simulated", "pack": ""}
+    assert json.loads(out) == {"file": str(EXAMPLES / "reference_backoff.toml"), "findings": [], "figures": [], **setting}
+    assert "nothing found" in chargetune_here("check", EXAMPLES / "reference_backoff.toml")[1]
+
+
+def test_check_tells_that_there_is_nothing_to_tune(chargetune_here):
+    code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml")
+    assert code == 0
+    assert "warning no-theta: theta is empty" in out
+    assert "add a table [theta.backoff]" in out
 
 
 def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune_here, study, tmp_path):

@@ -21,6 +21,16 @@ from chargetune.runtime.interrupts import raise_lost_interrupt
 __all__ = ["check_command", "facts", "print_findings"]
 
 
+# A controller without theta can be simulated and compared, and not tuned.
+NO_THETA = Finding(
+    "no-theta",
+    "warning",
+    "theta is empty: there is nothing to tune, and tune refuses it",
+    "add a table [theta.backoff], [theta.R0] or [theta.R1]",
+    {},
+)
+
+
 def check_command(path: Path, *, safe: str | None, figures: Path | None, overwrite: bool, as_json: bool) -> None:
     """Check the formulation of a study file; exit code 1 when an error is found."""
     from chargetune.cli.simulate import parse_theta
@@ -39,6 +49,8 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
     raise_lost_interrupt()
+    if not problem.space.dimension:
+        findings = (NO_THETA, *findings)
     drawn: list[Path] = []
     if figures is not None and findings:
         from chargetune.report.figures.check_findings import save_findings
