@@ -33,6 +33,59 @@ def theta_figures(view: StudyView, found: Sequence[Importance]) -> str:
     """Importance of the entries of theta, all trials as parallel coordinates, and slices."""
     parts = []
     if found and view.start_label == "untuned":
+        said = (
+            "Objective lost when one entry of theta, or a whole parameter, is put back to its untuned value; the others stay as they are."
+        )
+        parts.append(paragraph(said + " Where it is negative, the untuned value has the better objective, and is often over a limit."))
+        parts.append('<div class="figures" id="importance"></div>\n')
+    elif found:
+        said = "Objective lost when one entry of theta, or a whole parameter, is put back to the value of the untuned controller"
+        parts.append(paragraph(f"{said}, which this study did not try; the others stay as they are."))
+        parts.append('<div class="figures" id="importance"></div>\n')
+    parts.append('<div class="figures large" id="parallel"></div>\n<div id="choice" class="tools"></div>\n')
+    parts.append('<div class="figures large" id="slices"></div>\n')
+    return section("theta", *parts)
+
+
+def promises(view: StudyView, promised: Sequence[Promise]) -> str:
+    """What safe mode said of each trial before it was tried, and what was spent of the budget."""
+    problem = view.problem
+    if problem is None or problem.safety is None:
+        return ""
+    budget = problem.safety.budget_mVs
+    total = promised[-1].total if promised else 0.0
+    bound = "no budget was set" if budget is None else f"of a budget of {budget:g} mV s"
+    parts = [
+        paragraph(
+            f"A theta was tried where it was predicted to keep every limit with a probability of at least {problem.safety.probability:g}. "
+            f"Spent beyond limit and tolerance of the voltage: {total:.3g} mV s, {bound}."
+        )
+    ]
+    rows: list[tuple[Cell, ...]] = []
+    for one in promised:
+        score = one.trial.score
+        verdict = ("no score", "") if score is None else ("kept", "good") if score.feasible else ("broken", "bad")
+        chance = "declared" if one.probability is None else f"{one.probability:.2f}"
+        rows.append((f"trial {one.trial.number}", chance, verdict, f"{one.spent:.3g}", f"{one.total:.3g}"))
+    headings = ("", "predicted probability", "measured", "spent (mV s)", "in all (mV s)")
+    return section("Safe mode", *parts, table(headings, rows) if rows else "")
+
+
+def certificate_of(view: StudyView, path: Path) -> dict[str, Any] | None:
+    """The certificate in a file where it is of this study, with ``path``; None where it is another's, or there is none."""
+    try:
+        stated: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        own = view.record is not None and stated["origin"]["study_sha256"] == view.record.identity_sha256
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return {**stated, "path": path} if own else None
+
+
+def certificate(view: StudyView, stated: dict[str, Any] | None) -> str:
+    """Figures and picture of the certificate; of a study without one how it is made."""
+    if view.problem is None:
+        return ""
+    if stated is None:
         how = "The command chargetune certify STORE makes one: the tuned controller on fresh episodes of its range of use"
         said = f"No certificate of this study was found beside its store. {how}, and a bound on the probability of a violation."
         return section("Certificate", paragraph(said))
