@@ -304,8 +304,10 @@ def _keys(data: Mapping[str, Any], needed: set[str], optional: set[str], where: 
     for name in unknown:
         # Of another case, or slightly misspelt: what it stands for is not told as missing beside it.
         near = next((k for k in known if k.lower() == name.lower()), None) or next(iter(get_close_matches(name, known, 1, 0.75)), None)
-        said.append(f"{name} is not a known key" + (f"; did you mean {near}?" if near else ""))
-        missing = [other for other in missing if other != near]
+        if near:
+            said.append(f"{name} is not a known key; did you mean {near}?")
+            missing, unknown = [k for k in missing if k != near], [k for k in unknown if k != name]
+    said += [f"{', '.join(unknown)} {'is not a known key' if len(unknown) == 1 else 'are not known keys'}"] if unknown else []
     said += [f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not given, and needed"] if missing else []
     if said:
         raise ValueError("\n".join(f"cell file {where}: {line}" for line in said) + f"\nknown keys are {', '.join(sorted(known))}")

@@ -18,11 +18,12 @@ __all__ = ["comparison_figure"]
 COLOURS = {
     "plant oracle": GREEN,
     "nominal MPC": BLUE,
+    "nominal offset-free MPC": "#8c564b",
     "tuned": ORANGE,
     "MPC with the true model": "#56B4E9",
     "best constant backoff": "#CC79A7",
 }
-DASHES = ("-", (0, (5, 1)), (0, (3, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)))
+DASHES = ("-", (0, (5, 1)), (0, (3, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2, 1, 2, 1, 2)))
 
 
 def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:

@@ -161,10 +161,13 @@ const Figures = (() => {
         });
       }
     }
-    data.push({
-      x: rows.map((row) => row.number), y: incumbents(rows, head.objective.larger), name: "best so far", mode: "lines", hoverinfo: "skip",
-      line: { color: colour("tuned"), width: 2, shape: "hv" },
-    });
+    const courseOfBest = incumbents(rows, head.objective.larger);
+    if (courseOfBest.some((value) => value !== null)) {
+      data.push({
+        x: rows.map((row) => row.number), y: courseOfBest, name: "best so far", mode: "lines", hoverinfo: "skip",
+        line: { color: colour("tuned"), width: 2, shape: "hv" },
+      });
+    }
     const values = rows.map((row) => row.value).filter((value) => value !== null), ends = [-0.02 * rows.length - 0.5, 1.02 * rows.length - 0.5];
     const line = (value, name, dash, ink) => data.push({ x: ends, y: [value, value], name, mode: "lines", hoverinfo: "name", line: { color: colour(ink), width: 1.5, dash } });
     if (head.objective.possible !== null && values.length) line(head.objective.possible, "best possible", "dot", "ink");
