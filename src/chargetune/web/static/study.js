@@ -42,7 +42,8 @@ function newest() {
 }
 
 function wanted() {
-  const list = [{ label: `newest (trial ${newest()})`, colour: "trials", number: newest() }];
+  // Where the newest one is the result it would lie below it.
+  const list = newest() === tuned ? [] : [{ label: `newest (trial ${newest()})`, colour: "trials", number: newest() }];
   list.push({ label: `${startLabel} (trial ${start})`, colour: "untuned", number: start });
   list.push({ label: `${tunedLabel} (trial ${tuned})`, colour: "tuned", number: tuned, dash: tuned === start ? "dash" : "" });
   const [one, other] = chosen;
