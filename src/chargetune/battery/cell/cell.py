@@ -21,6 +21,7 @@ from chargetune.battery.validation import check_count
 
 __all__ = [
     "CAPACITY_MAX_AH",
+    "FLAT_BELOW_V",
     "PACK",
     "PACK_MAX",
     "PAIRS_MAX",
