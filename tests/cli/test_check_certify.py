@@ -30,11 +30,12 @@ def study(tmp_path):
 
 
 def test_check_is_silent_on_an_example(chargetune_here, tmp_path):
-    code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml", "--json", "--figures", tmp_path / "f")
+    code, out, _ = chargetune_here("check", EXAMPLES / "reference_backoff.toml", "--json", "--figures", tmp_path / "f")
     assert code == 0
     told = json.loads(out)
-    assert told == {"file": str(EXAMPLES / "reference_model.toml"), "findings": [], "figures": [], "note": told["note"]}
-    text = chargetune_here("check", EXAMPLES / "reference_model.toml")[1]
+    setting = {"plant": "its own circuit, simulated", "pack": "", "note": told["note"]}
+    assert told == {"file": str(EXAMPLES / "reference_backoff.toml"), "findings": [], "figures": [], **setting}
+    text = chargetune_here("check", EXAMPLES / "reference_backoff.toml")[1]
     assert "nothing found" in text
     assert f"note: {told['note']}\n" in text
 
@@ -50,6 +51,13 @@ def test_check_says_that_a_measured_voltage_is_not_read(chargetune_here, tmp_pat
     else:
         assert f"estimator.kind = '{kind}' does not read it" in note
         assert "kind = 'offset_free' or 'adaptive' reads it" in note
+
+
+def test_check_tells_that_there_is_nothing_to_tune(chargetune_here):
+    code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml")
+    assert code == 0
+    assert "warning no-theta: theta is empty" in out
+    assert "add a table [theta.backoff]" in out
 
 
 def test_check_tells_an_error_with_its_figure_and_exit_code(chargetune_here, study, tmp_path):

@@ -90,7 +90,8 @@ def test_what_is_refused(run, store, arguments, words):
 
 def test_port_that_is_taken(run, store):
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert "in use" in run("web", store, "--port", taken.getsockname()[1], refused=True)
+        port = taken.getsockname()[1]
+        assert f"--port {port} is taken on 127.0.0.1" in run("web", store, "--port", port, refused=True)
 
 
 def read(address, **headers):

@@ -13,6 +13,8 @@ MEANINGS = {
     "date": "moment, used where there is no clock; otherwise compared with it",
     "current": "current",
     "voltage": "voltage of the cell",
+    "charging": "charging current, where the file has one column for either way",
+    "discharging": "discharging current, subtracted from the charging one",
     "counter": "voltage of the counter electrode, subtracted from Ewe where Ewe-Ece is missing",
     "temperature": "temperature",
     "state": "state: its words for charge and discharge give a current its sign",

@@ -43,9 +43,9 @@ def test_a_model_crosses_processes():
         ({"sampling_time_s": np.nan}, ["sampling_time_s = nan"]),
         ({"sampling_time_s": True}, ["sampling_time_s = True"]),
         ({"parameters": {"gain": np.inf, "table": [1.0, 2.0]}}, ["gain", "finite"]),
-        ({"equations": lambda x, _, __: ({"a": x["a"]}, {"y": 0})}, ["missing ['b']"]),
-        ({"equations": lambda x, _, __: ({"a": 0, "b": 0, "c": 0}, {"y": x["a"]})}, ["unknown ['c']"]),
-        ({"equations": lambda x, _, __: ({"a": 0, "b": 0}, {})}, ["outputs", "missing ['y']"]),
+        ({"equations": lambda x, _, __: ({"a": x["a"]}, {"y": 0})}, ["missing b; expected exactly a, b"]),
+        ({"equations": lambda x, _, __: ({"a": 0, "b": 0, "c": 0}, {"y": x["a"]})}, ["unknown c"]),
+        ({"equations": lambda x, _, __: ({"a": 0, "b": 0}, {})}, ["outputs", "missing y"]),
         ({"states": (Signal("a"), Signal("a"))}, ["states"]),
     ],
 )

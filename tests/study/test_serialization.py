@@ -66,7 +66,7 @@ def test_canonical_json_names_the_place(value, message):
         ({"a": {"b": 1, "c": 2}}, {"a": {"b": 2, "d": 2}}, ["a.b: 1 -> 2", "a.c: 2 -> (absent)", "a.d: (absent) -> 2"]),
         ({"a": [1, {"b": 2}]}, {"a": [1, {"b": 3}]}, ["a[1].b: 2 -> 3"]),
         ({"a": [1]}, {"a": [1, 2]}, ["a: [1] -> [1, 2]"]),
-        ({"a": "x" * 100}, {"a": None}, ['a: "' + "x" * 56 + "... -> null"]),
+        ({"a": "x" * 100}, {"a": None}, ['a: "' + "x" * 56 + "... -> (not given)"]),
     ],
 )
 def test_differences(old, new, lines):

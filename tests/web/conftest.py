@@ -16,7 +16,8 @@ from report_studies import charging, other_study, run_charging
 
 from chargetune.web.app import make_app
 
-TIMEOUT_MS = 20_000
+# Far beyond what any step takes, also on a loaded machine.
+TIMEOUT_MS = 90_000
 
 
 @pytest.fixture(scope="session")

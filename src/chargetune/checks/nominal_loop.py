@@ -13,7 +13,7 @@ from chargetune.checks.estimator import check_detectability
 from chargetune.checks.finding import Evidence, Finding
 from chargetune.checks.influence import check_influence
 from chargetune.checks.solves import check_costs, check_solves
-from chargetune.checks.static import check_horizon, check_signs, check_start, model_at, noticeable, row_values
+from chargetune.checks.static import amount, beyond_axis, check_horizon, check_signs, check_start, model_at, noticeable, row_values, unit_of
 from chargetune.control.controller import Controller, LimitRows
 from chargetune.episode.compiled import simulate
 from chargetune.episode.episode import Episode
@@ -117,13 +117,14 @@ def check_limits(
             ends["start"] = ends["end"]
         seen = np.max([ends[name] for name in ("start", "end") if limit.at in (name, "both")], axis=0)
         if np.isnan(seen).any():
-            out.append(_not_known(limit, run, seen))
+            out.append(_not_known(controller, limit, run, seen))
             continue
         inside = np.maximum(ends["start"], ends["end"]) + _hump(controller, j, finer, run, theta, given)
         if np.max(seen) > noticeable(limit):
             out += _broken_where_seen(controller, j, run, seen, theta, given)
         elif np.max(inside) > noticeable(limit):
-            out.append(_between(limit, run, seen, inside, at_ends=max(float(np.max(values)) for values in ends.values())))
+            at_ends = max(float(np.max(values)) for values in ends.values())
+            out.append(_between(controller, limit, run, seen, inside, at_ends=at_ends))
     return out
 
 
@@ -161,7 +162,8 @@ def _broken_where_seen(
 ) -> list[Finding]:
     """What it means that the limit is broken where the controller sees it: whether a larger penalty would have kept it."""
     limit, worst = controller.limits[j], float(np.max(seen))
-    minutes, name = run.time_s / 60, f"{limit.of} beyond its limit"
+    minutes, name = run.time_s / 60, beyond_axis(controller, limit)
+    broken, unit = amount(controller, limit.of, worst), unit_of(controller, limit.of)
 
     def with_penalty(factor: float) -> NDArray[np.float64]:
         limits = tuple(replace(part, penalty=part.penalty * factor) if k == j else part for k, part in enumerate(controller.limits))
@@ -175,9 +177,9 @@ def _broken_where_seen(
             Finding(
                 "inexact-penalty",
                 "error",
-                f"the penalty of {limit.of} is not exact: a perfect model breaks the limit by {worst:.4g}, "
+                f"the penalty of {limit.of} is not exact: a perfect model breaks the limit by {broken}, "
                 f"with {factor:g} times the penalty it does not",
-                f"a penalty of {limit.of} of at least {factor * limit.penalty:g} (it is {limit.penalty:g})",
+                f"a penalty of {limit.of} of at least {factor * limit.penalty:g}{f' per {unit}' if unit else ''} (it is {limit.penalty:g})",
                 {
                     "excess": worst,
                     "penalty": limit.penalty,
@@ -191,7 +193,7 @@ def _broken_where_seen(
         Finding(
             "limit-not-kept",
             "warning",
-            f"a perfect model breaks the limit of {limit.of} by {worst:.4g}, also with {STRICTER[-1]:g} times the penalty",
+            f"a perfect model breaks the limit of {limit.of} by {broken}, also with {STRICTER[-1]:g} times the penalty",
             "a longer horizon, an input range that can keep it, or another start",
             {"excess": worst, "penalty": limit.penalty},
             Evidence("time (min)", name, {"closed loop": (minutes, seen)}, {"limit": 0.0}),
@@ -231,7 +233,7 @@ def _signals(controller: Controller, given: Given | None, count: int) -> tuple[N
     return now, then
 
 
-def _not_known(limit: LimitRows, run: Episode, seen: NDArray[np.float64]) -> Finding:
+def _not_known(controller: Controller, limit: LimitRows, run: Episode, seen: NDArray[np.float64]) -> Finding:
     lost = np.isnan(seen)
     return Finding(
         "limit-not-kept",
@@ -240,22 +242,24 @@ def _not_known(limit: LimitRows, run: Episode, seen: NDArray[np.float64]) -> Fin
         f"{run.time_s[np.argmax(lost)] / 60:.3g} min: a limit that is not known is not kept",
         f"an expression of {limit.of} and of its bound that is defined wherever the model goes",
         {"intervals": float(np.sum(lost)), "first_min": float(run.time_s[np.argmax(lost)] / 60)},
-        Evidence("time (min)", f"{limit.of} beyond its limit", {"closed loop": (run.time_s / 60, seen)}, {"limit": 0.0}),
+        Evidence("time (min)", beyond_axis(controller, limit), {"closed loop": (run.time_s / 60, seen)}, {"limit": 0.0}),
     )
 
 
-def _between(limit: LimitRows, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float) -> Finding:
+def _between(
+    controller: Controller, limit: LimitRows, run: Episode, seen: NDArray[np.float64], inside: NDArray[np.float64], *, at_ends: float
+) -> Finding:
     coarse = at_ends <= noticeable(limit)
     return Finding(
         "between-samples",
         "warning",
-        f"a perfect model breaks the limit of {limit.of} by {float(np.max(inside)):.4g} "
+        f"a perfect model breaks the limit of {limit.of} by {amount(controller, limit.of, float(np.max(inside)))} "
         + ("inside the control intervals, though both ends keep it" if coarse else f"where it is not limited (only at the {limit.at})"),
         "a shorter sampling time" if coarse else f'limit {limit.of} at both ends of every interval (at = "both")',
         {"excess": float(np.max(inside)), "excess_where_limited": float(np.max(seen)), "sampling_time_s": run.sampling_time_s},
         Evidence(
             "time (min)",
-            f"{limit.of} beyond its limit",
+            beyond_axis(controller, limit),
             {"where it is limited": (run.time_s / 60, seen), "anywhere in the interval": (run.time_s / 60, inside)},
             {"limit": 0.0},
         ),

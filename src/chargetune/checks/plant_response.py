@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chargetune.checks.finding import Evidence, Finding
-from chargetune.checks.static import model_at
+from chargetune.checks.static import model_at, titled, unit_of
 from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 
@@ -51,7 +51,7 @@ def check_response(controller: Controller, run: Episode, theta: ArrayLike | None
                     {"correlation": likeness},
                     Evidence(
                         "time (s)",
-                        f"change of {name} in an interval",
+                        titled(f"change of {name} in an interval", unit_of(controller, name)),
                         {"plant": (run.time_s, end - start), "model": (run.time_s, at_end[:, i] - at_start[:, i])},
                         {"zero": 0.0},
                     ),

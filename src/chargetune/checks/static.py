@@ -14,7 +14,18 @@ from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller, LimitRows
 from chargetune.model.model import Model
 
-__all__ = ["check_horizon", "check_signs", "check_start", "model_at", "noticeable", "row_values"]
+__all__ = [
+    "amount",
+    "beyond_axis",
+    "check_horizon",
+    "check_signs",
+    "check_start",
+    "model_at",
+    "noticeable",
+    "row_values",
+    "titled",
+    "unit_of",
+]
 
 # A violation below this share of a limit's scale is the solver's tolerance, with some room.
 NOTICEABLE = 1e-2
@@ -36,6 +47,27 @@ def model_at(controller: Controller, theta: ArrayLike | None = None, given: Arra
         named[name] = values[first : first + size]
         first += size
     return model.with_parameters(**named)
+
+
+def unit_of(controller: Controller, name: str) -> str:
+    """Unit of an output, a state or an input of the controller's model; empty where it has none, or the name is of none of them."""
+    model = controller.model
+    return next((s.unit for s in (*model.outputs, *model.states, *model.inputs) if s.name == name and s.unit != "1"), "")
+
+
+def amount(controller: Controller, name: str, value: float) -> str:
+    """A value of a signal with its unit."""
+    return f"{value:.4g} {unit_of(controller, name)}".rstrip()
+
+
+def titled(label: str, unit: str) -> str:
+    """The label of an axis with its unit."""
+    return f"{label} ({unit})" if unit else label
+
+
+def beyond_axis(controller: Controller, limit: LimitRows) -> str:
+    """The label of an axis of what is beyond a limit."""
+    return titled(f"{limit.of} beyond its limit", unit_of(controller, limit.of))
 
 
 def row_values(
@@ -96,6 +128,8 @@ def check_signs(
         wrong = float(np.mean(sign * values <= 0))
         if wrong:
             words = ("falls", "rise") if sign > 0 else ("rises", "fall")
+            above, below = unit_of(controller, output) or "1", unit_of(controller, name)
+            slope_axis = titled(f"d {output} / d {name}", f"{above}/{below}" if below else above)
             out.append(
                 Finding(
                     "wrong-sign",
@@ -104,7 +138,7 @@ def check_signs(
                     f"the sign of {name} or of a term of {output} in the model is wrong: current is positive when it charges, "
                     "V = OCV + U1 + R0 I",
                     {"share_wrong": wrong, "slope_mean": float(np.mean(values)), "expected_sign": float(sign)},
-                    Evidence("state looked at", f"d {output} / d {name}", {"model": (points.astype(float), values)}, {"zero": 0.0}),
+                    Evidence("time (min)", slope_axis, {"model": (points * model.sampling_time_s / 60, values)}, {"zero": 0.0}),
                 )
             )
     return tuple(out)
@@ -121,6 +155,7 @@ def check_start(controller: Controller, theta: ArrayLike | None = None, given: N
     lower, upper = (np.array(bound).ravel()[:nu] for bound in problem.bounds(now, q))
     each = [sorted({low, high, float(np.clip(0.0, low, high))}) for low, high in zip(lower, upper, strict=True)]
     choices = np.array(list(itertools.product(*each)))
+    tried = titled(f"{controller.model.input_names[0]} tried", unit_of(controller, controller.model.input_names[0]))
     out = []
     for j, limit in enumerate(controller.limits):
         if limit.at == "terminal":
@@ -130,7 +165,7 @@ def check_start(controller: Controller, theta: ArrayLike | None = None, given: N
         # An input that gives no number keeps no limit.
         least = float(np.min(np.where(np.isnan(excess), np.inf, excess)))
         if least > noticeable(limit):
-            beyond = f"beyond its limit by {least:.4g}" if np.isfinite(least) else "no finite number"
+            beyond = f"beyond its limit by {amount(controller, limit.of, least)}" if np.isfinite(least) else "no finite number"
             out.append(
                 Finding(
                     "unsafe-start",
@@ -138,7 +173,7 @@ def check_start(controller: Controller, theta: ArrayLike | None = None, given: N
                     f"{limit.of} is {beyond} at the start, whatever the input",
                     f"start elsewhere, move the limit of {limit.of}, or allow an input that keeps it",
                     {"least_excess": least},
-                    Evidence("input tried", f"{limit.of} beyond its limit", {"start": (choices[:, 0], excess)}, {"limit": 0.0}),
+                    Evidence(tried, beyond_axis(controller, limit), {"start": (choices[:, 0], excess)}, {"limit": 0.0}),
                 )
             )
     return tuple(out)
@@ -181,8 +216,8 @@ def check_horizon(
         Finding(
             "short-horizon",
             "warning",
-            f"the horizon spans {span:.3g} s, less than half of the model's fastest time constant, {constant:.3g} s: "
-            "the controller acts almost as if the model had no dynamics",
+            f"the horizon spans {span:.3g} s, less than half of the model's fastest time constant, {constant:.3g} s "
+            "(the median along the closed loop): the controller acts almost as if the model had no dynamics",
             f"a horizon of at least {least} intervals, or a longer sampling time",
             {
                 "horizon_s": span,
@@ -190,7 +225,7 @@ def check_horizon(
                 "horizon_intervals": float(controller.horizon),
                 "least_intervals": float(least),
             },
-            Evidence("state looked at", "time (s)", {"fastest time constant": (points.astype(float), constants)}, {"horizon": span}),
+            Evidence("time (min)", "fastest time constant (s)", {"closed loop": (points * step / 60, constants)}, {"horizon": span}),
         ),
     )
 

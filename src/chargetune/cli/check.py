@@ -14,11 +14,21 @@ from rich.console import Console
 from chargetune.battery.charging.checks import check_charging
 from chargetune.battery.studies.study_file import load_config
 from chargetune.checks.finding import Finding
-from chargetune.cli.output import console
+from chargetune.cli.output import console, setting
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["check_command", "facts", "print_findings"]
+
+
+# A controller without theta can be simulated and compared, and not tuned.
+NO_THETA = Finding(
+    "no-theta",
+    "warning",
+    "theta is empty: there is nothing to tune, and tune refuses it",
+    "add a table [theta.backoff], [theta.R0] or [theta.R1]",
+    {},
+)
 
 
 def check_command(path: Path, *, safe: str | None, figures: Path | None, overwrite: bool, as_json: bool) -> None:
@@ -39,15 +49,19 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
     raise_lost_interrupt()
+    if not problem.space.dimension:
+        findings = (NO_THETA, *findings)
     drawn: list[Path] = []
     if figures is not None and findings:
         from chargetune.report.figures.check_findings import save_findings
 
         drawn = save_findings(findings, figures)
     if as_json:
-        found = {"findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}
-        print(json.dumps({"file": str(path), **found, "note": problem.estimator.unread}))  # noqa: T201
+        found = {"file": str(path), "findings": [facts(f) for f in findings], "figures": [str(f) for f in drawn]}
+        print(json.dumps(found | setting(problem) | {"note": problem.estimator.unread}))  # noqa: T201
     else:
+        for line in problem.setting_lines:
+            screen.print(line, markup=False, style="dim", soft_wrap=True)
         print_findings(findings, screen)
         if problem.estimator.unread:
             screen.print(f"note: {problem.estimator.unread}", markup=False, soft_wrap=True)

@@ -13,7 +13,7 @@ from chargetune.battery.baselines.comparison import Row, chosen_rows, compare, r
 from chargetune.battery.baselines.range_comparison import DRAWS, ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
-from chargetune.cli.output import console, number, result_line, shown, workers_for
+from chargetune.cli.output import console, number, result_line, setting, shown, workers_for
 from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
@@ -75,7 +75,8 @@ def compare_command(
 
         save(comparison_figure(problem, done), figure)
     if as_json:
-        print(json.dumps({"rows": [_facts(row) for row in done], "result": None if result is None else result.facts()}))  # noqa: T201
+        told = {"rows": [_facts(row) for row in done], "result": None if result is None else result.facts()}
+        print(json.dumps(told | setting(problem)))  # noqa: T201
         return
     screen = console()
     screen.print(_table(done))

@@ -17,7 +17,19 @@ from chargetune.study.result import StudyResult
 from chargetune.study.store.database import database_at
 from chargetune.study.store.sqlite import SqliteFile
 
-__all__ = ["beside", "console", "loss_of", "metrics_table", "number", "plants_over", "result_line", "shown", "theta_lines", "workers_for"]
+__all__ = [
+    "beside",
+    "console",
+    "loss_of",
+    "metrics_table",
+    "number",
+    "plants_over",
+    "result_line",
+    "setting",
+    "shown",
+    "theta_lines",
+    "workers_for",
+]
 
 # Figures of a charge beside its objective and its limits.
 ROWS = ("t80_min", "t90_min", "t95_min", "t99_min", "switch_min", "soc_end", "violation_mVs", "solver_failures")
@@ -108,6 +120,11 @@ def workers_for(wanted: int, work: int, what: str) -> int:
     if said:
         console(stderr=True).print(f"--{said}", markup=False, soft_wrap=True)
     return count
+
+
+def setting(problem: ChargingProblem) -> dict[str, str]:
+    """For JSON: what the plant is, and of how many cells a pack, whose numbers are all those of one cell; empty for a single one."""
+    return {"plant": problem.plant_line, "pack": problem.cell.pack_line}
 
 
 def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[float]) -> str:

@@ -44,12 +44,13 @@ def show_command(location: str, *, study: str | None, as_json: bool) -> None:
 
 def _list(views: list[StudyView]) -> None:
     table = Table(box=None, pad_edge=False)
-    for heading in ("study", "trials", "failed", "violating", "best trial", "its objective", "begun"):
+    apart = ("apart",) if any(t.status is TrialStatus.APART for view in views for t in view.trials) else ()
+    for heading in ("study", "trials", "failed", *apart, "violating", "best trial", "its objective", "begun"):
         table.add_column(heading, justify="left" if heading in ("study", "its objective", "begun") else "right")
     for view in views:
         s, best = _summary(view), view.result.kept
         begun = "" if view.record is None else view.record.created_at[:10]
-        counts = (str(s[name]) for name in ("done", "failed", "violating"))
+        counts = (str(s[name]) for name in ("done", "failed", *apart, "violating"))
         table.add_row(escape(view.name), *counts, str(best.number) if best else "-", _objective(view, best), begun)
     screen = console()
     screen.print(table)
@@ -109,10 +110,24 @@ def _show_trials(view: StudyView) -> None:
     for t in trials:
         if t.status is TrialStatus.FAILED:
             screen.print(f"trial {t.number} failed: {escape(t.ending or 'no reason is stored')}", soft_wrap=True)
+    apart: dict[str, list[int]] = {}
+    for t in trials:
+        if t.status is TrialStatus.APART:
+            apart.setdefault((t.ending or "no reason is stored").removeprefix("set apart: "), []).append(t.number)
+    for reason, numbers in apart.items():
+        named = f"trial {numbers[0]}" if len(numbers) == 1 else f"trials {', '.join(_stretches(numbers))}"
+        screen.print(f"{named} set apart, in no result: {escape(reason)}", soft_wrap=True)
     screen.print(result_line(view.result), soft_wrap=True)
     if best is not None and not entries:
         units = [p.unit for p in view.space.parameters for _ in range(p.size)]
         screen.print(f"theta of trial {best.number} (*):\n{escape(theta_lines(view.space.entries, units, best.theta))}")
+
+
+def _stretches(numbers: list[int]) -> list[str]:
+    """Increasing numbers, those that follow each other as "3 to 7"."""
+    ends = [k for k, n in enumerate(numbers) if k + 1 == len(numbers) or numbers[k + 1] != n + 1]
+    starts = [0, *(k + 1 for k in ends[:-1])]
+    return [str(numbers[a]) if a == b else f"{numbers[a]} to {numbers[b]}" for a, b in zip(starts, ends, strict=True)]
 
 
 def _excess(trial: Trial, limit: LimitWords) -> float:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from chargetune.battery.charging.evaluate import outcome, run_charge
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.battery.studies.study_file import load_config
-from chargetune.cli.output import console, metrics_table
+from chargetune.cli.output import console, metrics_table, setting
 from chargetune.cli.outputs import Kind, Output, claim, figure_kind, read_by
 from chargetune.report.figures.style import check_format, save
 from chargetune.report.figures.trajectories import episode_figure
@@ -78,6 +78,7 @@ def simulate_command(
                 "feasible": score.feasible,
             },
             "metrics": dict(score.metrics),
+            **setting(problem),
         }
         print(json.dumps(data))  # noqa: T201
         return

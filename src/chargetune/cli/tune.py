@@ -24,7 +24,7 @@ from chargetune.battery.charging.wording import objective_words
 from chargetune.battery.studies.open_study import evaluation_of, open_study
 from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.cli.check import print_findings
-from chargetune.cli.output import console, loss_of, metrics_table, number, result_line, shown, theta_lines, workers_for
+from chargetune.cli.output import console, loss_of, metrics_table, number, result_line, setting, shown, theta_lines, workers_for
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
@@ -300,4 +300,5 @@ def _summary(config: Config, problem: ChargingProblem, trials: list[Trial], resu
         "tuned": facts(best),
         "result": result.facts(),
         "theta": dict(zip(problem.space.entries, best.theta, strict=True)) if best else None,
+        **setting(problem),
     }

@@ -41,7 +41,7 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
         server = uvicorn.Server(config)
         where = f"[{host}]" if family == socket.AF_INET6 else host
         secret = "" if token is None else " (once with ?token=... behind it)"
-        console().print(f"{label}: http://{where}:{bound}/{secret}, Ctrl-C ends it", markup=False, soft_wrap=True)
+        console().print(f"{label}: http://{where}:{bound}/{secret} (Ctrl-C ends it)", markup=False, soft_wrap=True)
         # uvicorn passes Ctrl-C on once it has ended in good order.
         with contextlib.suppress(KeyboardInterrupt), unwatched():
             server.run(sockets=[listening])

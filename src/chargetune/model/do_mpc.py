@@ -37,7 +37,8 @@ def from_do_mpc(
     told = dict(parameters)
     if set(told) != set(needed):
         missing, unknown = sorted(set(needed) - set(told)), sorted(set(told) - set(needed))
-        raise ValueError(f"do-mpc model {name}: parameters missing {missing}, unknown {unknown}; expected exactly {needed}")
+        said = [f"{word} {', '.join(found)}" for word, found in (("missing", missing), ("unknown", unknown)) if found]
+        raise ValueError(f"do-mpc model {name}: parameters {', '.join(said)}; expected exactly {', '.join(needed) or '(none)'}")
     x, u, p = (ca.SX.sym(label, size) for label, size in (("x", model.n_x), ("u", model.n_u), ("p", model.n_p + model.n_tvp)))
     of_p, of_tvp = ca.vertsplit(p, [0, model.n_p, model.n_p + model.n_tvp])
     noise = {of: ca.DM.zeros(getattr(model, f"n_{of}"), 1) for of in "wv"}

@@ -229,7 +229,8 @@ def _stack(values: Mapping[str, Any], signals: Sequence[Signal], where: str) -> 
     names = [s.name for s in signals]
     if set(values) != set(names):
         missing, unknown = sorted(set(names) - set(values)), sorted(set(values) - set(names))
-        raise ValueError(f"{where}: missing {missing}, unknown {unknown}; expected exactly {names}")
+        said = [f"{word} {', '.join(found)}" for word, found in (("missing", missing), ("unknown", unknown)) if found]
+        raise ValueError(f"{where}: {', '.join(said)}; expected exactly {', '.join(names) or '(none)'}")
     return ca.vertcat(*(values[n] for n in names)) if names else ca.SX(0, 1)
 
 

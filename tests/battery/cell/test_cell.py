@@ -189,9 +189,9 @@ def test_a_file_there_and_back(cell, tmp_path):
     ("edit", "said"),
     [
         (lambda text: text.replace("capacity_Ah = 2.0", "capacity_Ah = 2,0"), ("not valid TOML",)),
-        (lambda text: text.replace("capacity_Ah", "capacity_mAh"), ("missing ['capacity_Ah']", "unknown ['capacity_mAh']")),
-        (lambda text: text.replace("R0_ohm", "R0_Ohm"), ("table [ecm]", "missing ['R0_ohm']", "unknown ['R0_Ohm']")),
-        (lambda text: text + "\n[thermal]\ncooling_W_K = 1", ("table [thermal]", "missing ['heat_capacity_J_K']")),
+        (lambda text: text.replace("capacity_Ah", "capacity_mAh"), ("capacity_mAh is not a known key; did you mean capacity_Ah?",)),
+        (lambda text: text.replace("R0_ohm", "R0_Ohm"), ("table [ecm]: R0_Ohm is not a known key; did you mean R0_ohm?", "are C1_F, ")),
+        (lambda text: text + "\n[thermal]\ncooling_W_K = 1", ("table [thermal]: heat_capacity_J_K is not given, and needed",)),
         (lambda text: text + "\n[thermal]\ncooling_W_K = 1\nheat_capacity_J_K = 50\nambient_K = 25", ("ambient_K = 25", "degC")),
         (lambda text: text + "\n[anode]\nsoc = [0, 1]\npotential_V = [0.2]\nresistance_ohm = [0.1]", ("have 2, 1 and 1 values",)),
         (lambda text: text.replace("[ocv]", "R2_ohm = [0.01]\n[ocv]"), ("R2_ohm and C2_F are given together",)),
@@ -200,8 +200,8 @@ def test_a_file_there_and_back(cell, tmp_path):
         (lambda text: text.replace("capacity_Ah = 2.0", "capacity_Ah = nan"), ("capacity_Ah = nan", "finite number")),
         (lambda text: text.replace("[ecm]", "[[ecm]]"), ("ecm = [", "expected a table [ecm]")),
         (lambda text: text.replace("soc = [0.1,", 'soc = "0.1" #'), ("ecm.soc = '0.1'", "expected a list of numbers")),
-        (lambda _text: "", ("missing", "capacity_Ah", "ecm", "ocv")),
-        (lambda text: text.replace("ocv", "OCV"), ("missing ['ocv']", "unknown ['OCV']")),
+        (lambda _text: "", ("capacity_Ah, ", "ecm", "ocv", " are not given, and needed")),
+        (lambda text: text.replace("ocv", "OCV"), ("OCV is not a known key; did you mean ocv?",)),
     ],
 )
 def test_a_bad_file_is_named_with_the_field(cell, tmp_path, edit, said):

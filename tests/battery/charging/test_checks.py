@@ -50,6 +50,16 @@ def test_nothing_is_found_in_an_example(path, monkeypatch):
     assert check_charging(found, quick=found.plant is not None) == ()
 
 
+def test_a_limit_far_above_the_full_cell_is_told():
+    full = CELL.ocv_V[-1]
+    high = replace(CELL, voltage_max_V=full + 0.19)
+    found = check_charging(charging_problem(high, mismatch_seed=1, R1=R1), quick=True)
+    message = next(f.message for f in found if f.code == "limit-above-full")
+    assert f"190 mV above the OCV of the full cell, {full:.4g} V" in message
+    flat = replace(CELL, ocv_V=tuple(np.linspace(2.9, 3.4, len(CELL.ocv_V))), voltage_max_V=3.65)
+    assert "limit-above-full" not in {f.code for f in check_charging(charging_problem(flat, mismatch_seed=1, R1=R1), quick=True)}
+
+
 def test_nothing_is_found_in_the_example_that_is_no_battery():
     example = runpy.run_path(str(EXAMPLES / "custom_system.py"))
     plant = SimulatedPlant(example["crane"](1.0), {})

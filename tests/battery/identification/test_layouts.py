@@ -168,3 +168,23 @@ def test_a_damaged_container_is_refused(name, content, said, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=f"^{name} .*{said}"):
         read_record(tmp_path / name)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("other", ["0", ""])
+def test_a_column_for_either_way_is_one_current(sign, other, tmp_path):
+    test, path = pulse_test(), tmp_path / "ways.csv"
+    rows = [
+        (f"{t:.3f}", f"{1e3 * i:.2f}" if i > 0 else other, f"{-sign * 1e3 * i:.2f}" if i < 0 else other, f"{v:.5f}")
+        for t, i, v in zip(test.time, test.current, test.voltage, strict=True)
+    ]
+    heading = ("Time_s", "Charge Current (mA)", "Discharge_Current_mA", "Voltage_V")
+    path.write_text("\n".join(",".join(row) for row in (heading, *rows)))
+    record = read_record(path)
+    np.testing.assert_allclose(record.current_A, test.current, atol=1e-5)
+    assert "current is Charge Current (mA) minus Discharge_Current_mA" in record.remarks
+    number = next(k for k, i in enumerate(test.current) if i > 0)
+    rows[number] = (rows[number][0], "1500", "500", rows[number][3])
+    path.write_text("\n".join(",".join(row) for row in (heading, *rows)))
+    with pytest.raises(ValueError, match=rf"row {number + 2}: Charge Current \(mA\) = 1.5 A and Discharge_Current_mA = 0.5 A, allowed is"):
+        read_record(path)

@@ -81,7 +81,7 @@ def test_what_lies_outside_of_narrower_bounds_is_no_result_and_counts_again_with
 @pytest.mark.parametrize(
     ("tables", "line"),
     [
-        ({"limits": {"voltage_max_V": 4.1}}, "limits.voltage_max_V: null -> 4.1"),
+        ({"limits": {"voltage_max_V": 4.1}}, "limits.voltage_max_V: (not given) -> 4.1"),
         ({"limits": {"tolerance_V": 0.05}}, "limits.tolerance_V: 0.0005 -> 0.05"),
         ({"episode": {"soc_target": 0.8}}, "episode.soc_target: 1.0 -> 0.8"),
         ({"objective": {"charge_time_to_soc": 0.2}}, "objective.charge_time_to_soc: (absent) -> 0.2"),
@@ -119,7 +119,7 @@ def test_a_lowered_limit_does_not_call_a_charge_kept_that_went_beyond_it(changed
         ({"controller": {"sampling_time_s": 20.0}}, "controller.sampling_time_s: 10.0 -> 20.0"),
         ({"sensors": {"voltage_noise_sd_V": 0.002}}, "sensors.voltage_noise_sd_V: 0.0 -> 0.002"),
         ({"episode": {"steps": 100}}, "episode.steps: 90 -> 100"),
-        ({"limits": {"current_max_A": 3.0}}, "limits.current_max_A: null -> 3.0"),
+        ({"limits": {"current_max_A": 3.0}}, "limits.current_max_A: (not given) -> 3.0"),
         ({"theta.backoff": {"at": "predicted"}}, 'theta.backoff.at: "measured" -> "predicted"'),
     ],
 )

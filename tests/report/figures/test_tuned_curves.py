@@ -32,8 +32,8 @@ def test_resistance_is_what_the_circuit_model_uses(stores, seed):
     ratio = np.random.default_rng(seed).uniform(0.1, 6.0, 9)
     tuned = replace(cell, R0_ohm=ratio * cell.R0_ohm, R1_ohm=ratio[::-1] * cell.R1_ohm)
     r0, r1 = model_resistances(tuned, soc)
-    np.testing.assert_allclose(resistance_values(problem, tuned.R0_ohm, soc), r0, rtol=1e-9, atol=1e-13)
-    np.testing.assert_allclose(resistance_values(problem, tuned.R1_ohm, soc), r1, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(resistance_values(cell.soc, tuned.R0_ohm, soc), r0, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(resistance_values(cell.soc, tuned.R1_ohm, soc), r1, rtol=1e-9, atol=1e-13)
 
 
 def test_backoff_is_what_the_controller_uses(stores):

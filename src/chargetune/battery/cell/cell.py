@@ -6,6 +6,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
+from difflib import get_close_matches
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,7 @@ from chargetune.battery.validation import check_count
 
 __all__ = [
     "CAPACITY_MAX_AH",
+    "FLAT_BELOW_V",
     "PACK",
     "PACK_MAX",
     "PAIRS_MAX",
@@ -297,9 +299,19 @@ def _pair(k: int) -> tuple[str, str]:
 
 
 def _keys(data: Mapping[str, Any], needed: set[str], optional: set[str], where: str) -> None:
-    missing, unknown = sorted(needed - set(data)), sorted(set(data) - needed - optional)
-    if missing or unknown:
-        raise ValueError(f"cell file {where}: missing {missing}, unknown {unknown}; allowed are {sorted(needed | optional)}")
+    known = needed | optional
+    missing, unknown = sorted(needed - set(data)), sorted(set(data) - known)
+    said = []
+    for name in unknown:
+        # Of another case, or slightly misspelt: what it stands for is not told as missing beside it.
+        near = next((k for k in known if k.lower() == name.lower()), None) or next(iter(get_close_matches(name, known, 1, 0.75)), None)
+        if near:
+            said.append(f"{name} is not a known key; did you mean {near}?")
+            missing, unknown = [k for k in missing if k != near], [k for k in unknown if k != name]
+    said += [f"{', '.join(unknown)} {'is not a known key' if len(unknown) == 1 else 'are not known keys'}"] if unknown else []
+    said += [f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not given, and needed"] if missing else []
+    if said:
+        raise ValueError("\n".join(f"cell file {where}: {line}" for line in said) + f"\nknown keys are {', '.join(sorted(known))}")
 
 
 def _number(name: str, value: object) -> None:

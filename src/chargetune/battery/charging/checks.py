@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.battery.cell.cell import FLAT_BELOW_V
 from chargetune.battery.charging.controller import controller_model, controller_of
 from chargetune.battery.charging.evaluate import evaluate, plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem, stand_in
@@ -29,6 +30,8 @@ MISSED_SOC = 0.05
 # Steps in which a simulated plant shows which way its current counts.
 PROBE_STEPS = 4
 FINER = 10
+# Where the OCV goes on rising beyond full, so far above the full cell's OCV the limit no longer keeps from overcharge, V.
+ABOVE_FULL_V = 0.1
 # With a measured overpotential a resistance that moves the excess by less than this share of what it moves it otherwise has no say.
 SAY = 0.25
 
@@ -57,7 +60,7 @@ def check_charging(problem: ChargingProblem, *, start: ArrayLike | None = None, 
     )
     if any(finding.code == "unsafe-start" for finding in found):
         return tuple(found)
-    found += _target(circuit)
+    found += [*_target(circuit), *_above_full(circuit)]
     if circuit.space.dimension:
         weak = _measured_overpotential(circuit)
         found += weak or check_theta(lambda theta: _beyond(circuit, theta), circuit.space)
@@ -102,6 +105,23 @@ def _target(problem: ChargingProblem) -> list[Finding]:
     else:
         return []
     return [Finding("unreachable-target", "warning", message, remedy, numbers, evidence)]
+
+
+def _above_full(problem: ChargingProblem) -> list[Finding]:
+    """An upper voltage limit so far above the OCV of the full cell that the charge may go on beyond SOC 1."""
+    full, limit = problem.cell.ocv_V[-1], problem.voltage_max_V
+    if full < FLAT_BELOW_V or limit <= full + ABOVE_FULL_V:
+        return []
+    return [
+        Finding(
+            "limit-above-full",
+            "warning",
+            f"voltage_max_V = {limit:g} V is {1e3 * (limit - full):.0f} mV above the OCV of the full cell, {full:.4g} V: "
+            "it does not keep the cell from being charged beyond SOC 1",
+            f"a voltage_max_V of at most {full + ABOVE_FULL_V:.4g} V, or an OCV and a capacity that reach to the voltage of the full cell",
+            {"voltage_max_V": limit, "ocv_full_V": full},
+        )
+    ]
 
 
 def _measured_overpotential(problem: ChargingProblem) -> list[Finding]:

@@ -142,7 +142,7 @@ class LimitSettings:
         for label in ("hard", "scored_only"):
             unknown = sorted(set(getattr(self, label)) - set(names))
             if unknown:
-                raise ValueError(f"{label} names {unknown}, allowed are the limits that are set: {', '.join(names)}")
+                raise ValueError(f"{label} names {', '.join(unknown)}, allowed are the limits that are set: {', '.join(names)}")
 
     def by_name(self, cell: Cell) -> dict[str, Limit]:
         """Every limit that is set on this cell, in the order of the score."""

@@ -130,7 +130,7 @@ class ChargingProblem:
         if not set(theta.limit_backoffs) <= kept:
             of = [f"{name}_backoff" for name in theta.limit_backoffs]
             raise ValueError(
-                f"theta has {', '.join(of)}, allowed is one of each limit that the controller's model predicts: {sorted(kept)}"
+                f"theta has {', '.join(of)}, allowed is one of each limit that the controller's model predicts: {', '.join(sorted(kept))}"
             )
         if theta.voltage_sd is not None:
             if not isinstance(self.estimator.settings, Kalman):

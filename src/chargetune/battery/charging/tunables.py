@@ -296,7 +296,7 @@ class Tunables:
         object.__setattr__(self, "observer", tuple(self.observer))
         names = [part.name for part in self.observer]
         if len(set(names)) < len(names):
-            raise ValueError(f"theta.observer names {names}, allowed are different names")
+            raise ValueError(f"theta.observer names {', '.join(names)}, allowed are different names")
         for of, part in self.limit_backoffs.items():
             widest, unit = WIDEST[of]
             check_number(f"{of}_backoff: lower", part.lower, -widest, 0.0, unit)

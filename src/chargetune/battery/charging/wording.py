@@ -29,7 +29,7 @@ METRIC_WORDS = {
     "anode_min_excess_mV": ("anode potential under its limit, largest sample", "mV"),
     "anode_min_excess_mVs": ("anode potential under its limit, integral", "mV s"),
     "solver_failures": ("control steps not solved to tolerance", ""),
-    "unsolved_percent": ("control steps not solved to tolerance", "%"),
+    "unsolved_percent": ("share of control steps not solved", "%"),
     "objective_worst": ("objective on the worst drawn plant", ""),
     "plants": ("drawn plants", ""),
     "violating_plants": ("drawn plants over a limit", ""),

@@ -25,6 +25,8 @@ QUANTITIES = {
     "date": ("", "Date and time of day of the sample."),
     "current": ("A", "Current that has flowed since the sample before."),
     "voltage": ("V", "Voltage of the cell."),
+    "charging": ("A", "Charging current, where the file has one column for either way instead of `current`."),
+    "discharging": ("A", "Discharging current; it is subtracted from the charging one."),
     "counter": ("V", "Potential of the counter electrode, where three are measured."),
     "temperature": ("degree Celsius", "Temperature of the cell; a column with holes is left out."),
     "state": ("", "Rest, charge or discharge, where the current has no sign."),

@@ -168,9 +168,10 @@ class _Circuit:
             if low or high:
                 # A resistance without bound is an OCV that is not what the rests say, as beside a knee.
                 help_ = "an OCV from a slow charge and discharge (--ocv)" if label[0] == "R" else "longer pulses"
+                unit = label.rpartition("_")[2]
                 raise ValueError(
-                    f"{self.place}: the data do not hold {label}; its fit ends at {np.exp(x[i]):.3g}, allowed is "
-                    f"{least:.3g} to {most:.3g}; {'faster sampling' if low else help_}{fewer} would"
+                    f"{self.place}: the data do not hold {label}; its fit ends at {np.exp(x[i]):.3g} {unit}, allowed is "
+                    f"{least:.3g} to {most:.3g} {unit}; {'faster sampling' if low else help_}{fewer} would"
                 )
             if not spread[i] <= SPREAD_MAX:
                 raise ValueError(

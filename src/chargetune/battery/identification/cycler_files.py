@@ -19,7 +19,7 @@ from chargetune.battery.cell.cell import PACK, PACK_MAX
 from chargetune.battery.identification.cells import clock_seconds, dates, decimal_mark, number
 from chargetune.battery.identification.clocks import DAY_S, Clock, elapsed
 from chargetune.battery.identification.current_sign import Sign, signed_by_state
-from chargetune.battery.identification.headings import Column, unit_of
+from chargetune.battery.identification.headings import WAYS, Column, unit_of
 from chargetune.battery.identification.layouts import NEEDED, UNITS
 from chargetune.battery.identification.plausibility import checked
 from chargetune.battery.identification.record import Record
@@ -37,6 +37,8 @@ CELSIUS_RANGE, KELVIN_RANGE = (-80.0, 200.0), (223.0, 400.0)
 MILLIVOLTS_FROM, AMPERES_TO = 100.0, 100.0
 # How a remark calls the order of a date.
 ORDERS = {"ymd": "year, month, day", "mdy": "month, day, year", "dmy": "day, month, year"}
+# Of two columns of current for either way the smaller is noise up to this share of the largest current.
+BOTH_SHARE = 0.01
 # Dates and clock of one file differ by less than this share.
 DATES_SHARE, DATES_READ = 0.02, 200
 
@@ -73,7 +75,7 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
     remarks, assumed = list(samples.remarks), list[str]()
     columns = _decided(samples.columns, options, remarks)
     source = next(q for q in ("time", "step_time", "date") if q in columns)
-    numeric = [q for q in ("current", "voltage", "counter", "temperature") if q in columns]
+    numeric = [q for q in ("current", *WAYS, "voltage", "counter", "temperature") if q in columns]
     try:
         mark = decimal_mark({columns[q].heading: samples.cells[q] for q in (*((source,) if source != "date" else ()), *numeric)})
     except ValueError as found:
@@ -86,9 +88,12 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
         try:
             arrays[quantity] = column.factor * np.array(_numbers(samples, quantity, mark))
         except ValueError as error:
-            if quantity in NEEDED:
+            if quantity in (*NEEDED, *WAYS):
                 raise
             remarks.append(f"the temperature was left out ({str(error).removeprefix(name + ', ')})")
+    both = "current" not in columns
+    if both:
+        columns["current"], arrays["current"] = _both_ways(samples, columns, arrays, remarks)
     if (options.series, options.parallel) != (1, 1):
         for quantity, count in (("voltage", options.series), ("counter", options.series), ("current", options.parallel)):
             if quantity in arrays:
@@ -99,8 +104,8 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
     current = arrays["current"]
     if len(current) < 2:
         raise ValueError(f"{name} has {len(current)} rows of numbers, allowed are at least 2")
-    known = False
-    if "state" in columns and options.sign is None:
+    known = both
+    if "state" in columns and options.sign is None and not both:
         signed = signed_by_state(name, current, samples.cells["state"], remarks)
         known, current = signed is not current, signed
     voltage = arrays["voltage"]
@@ -122,7 +127,7 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
 def _decided(columns: dict[str, Column], options: Reading, remarks: list[str]) -> dict[str, Column]:
     """The columns with the units that the person gave."""
     decided = dict(columns)
-    for unit, quantities in ((options.time_unit, ("time", "step_time")), (options.current_unit, ("current",))):
+    for unit, quantities in ((options.time_unit, ("time", "step_time")), (options.current_unit, ("current", *WAYS))):
         for quantity in quantities:
             if unit is not None and quantity in decided:
                 decided[quantity] = replace(decided[quantity], unit=unit_of(unit))
@@ -145,10 +150,29 @@ def _numbers(samples: Samples, quantity: str, mark: str) -> list[float]:
         return quick
     for row, cell in zip(samples.numbers, samples.cells[quantity], strict=True):
         try:
-            values.append(number(cell, mark))
+            # Of two columns for either way a cycler may leave the other one empty.
+            values.append(0.0 if quantity in WAYS and not cell else number(cell, mark))
         except ValueError as error:
             raise ValueError(f"{samples.name}, row {row}: {column.heading} = {cell!r}, allowed is {error}") from None
     return values
+
+
+def _both_ways(
+    samples: Samples, columns: dict[str, Column], arrays: dict[str, NDArray[np.float64]], remarks: list[str]
+) -> tuple[Column, NDArray[np.float64]]:
+    """(column, A) of one current, positive when it charges, from a column for either way."""
+    charge, discharge = (columns[way] for way in WAYS)
+    into, out = (np.abs(arrays[way]) for way in WAYS)
+    largest = max(float(np.max(into, initial=0.0)), float(np.max(out, initial=0.0)))
+    twice = np.flatnonzero(np.minimum(into, out) > BOTH_SHARE * largest)
+    if twice.size:
+        k = int(twice[0])
+        raise ValueError(
+            f"{samples.name}, row {samples.numbers[k]}: {charge.heading} = {into[k]:g} A and {discharge.heading} = {out[k]:g} A, "
+            "allowed is a current in one of them at a time"
+        )
+    remarks.append(f"current is {charge.heading} minus {discharge.heading}")
+    return replace(charge, quantity="current"), into - out
 
 
 def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remarks: list[str]) -> tuple[NDArray[np.float64], bool]:

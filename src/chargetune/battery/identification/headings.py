@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 from chargetune.battery.identification.layouts import NAMES, NEEDED, UNITS
 
-__all__ = ["Column", "columns_of", "missing", "unit_of", "units_below"]
+__all__ = ["WAYS", "Column", "columns_of", "missing", "unit_of", "units_below"]
 
 # Words that say how a number was got and not what it is.
 FILLERS = {"measured", "meas", "in", "value", "actual", "act"}
+WAYS = ("charging", "discharging")
 CLOCKS = ("time", "step_time", "date")
 BRACKETS = re.compile(r"[(\[{]([^()\[\]{}]*)[)\]}]")
 
@@ -73,12 +74,16 @@ def columns_of(row: Sequence[str]) -> tuple[dict[str, Column], dict[str, list[Co
         # One name twice, as "~Time[h]" and "Time": the one with a unit.
         order = [column for _, column in sorted(candidates, key=lambda pair: (pair[0], not pair[1].unit, pair[1].index))]
         chosen[quantity], others[quantity] = order[0], order[1:]
+    # One current that is signed says more than two, which may be those of a charger and a load.
+    for quantity in WAYS if "current" in chosen or not {*WAYS} <= {*chosen} else ():
+        chosen.pop(quantity, None)
     return chosen, others, odd
 
 
 def missing(found: dict[str, Column]) -> list[str]:
-    """The needed quantities that no column has; any clock or date serves as time."""
-    return [q for q in NEEDED if q not in found and not (q == "time" and (set(CLOCKS) & set(found)))]
+    """The needed quantities that no column has; any clock or date serves as time, and two currents of either way as one."""
+    instead = {"time": {*CLOCKS}, "current": {*WAYS}}
+    return [q for q in NEEDED if q not in found and not instead.get(q, set()) & set(found)]
 
 
 def units_below(found: dict[str, Column], row: Sequence[str]) -> dict[str, Column] | None:

@@ -145,6 +145,12 @@ NAMES: dict[str, tuple[str, ...]] = {
         "eweece", "ecell", "cellvoltage", "vcell", "ucell", "terminalvoltage", "batteryvoltage", "voltage", "volts", "volt", "vol",
         "cellpotential", "potential", "ubat", "ubatt", "vbat", "vbatt", "u", "v", "e", "ewe", "spannung", "电压",
     ),
+    # Two columns, one for either way, where there is none for both.
+    "charging": ("chargecurrent", "chargingcurrent", "currentcharge", "currentcharging", "chgcurrent", "ichg", "icharge", "ladestrom"),
+    "discharging": (
+        "dischargecurrent", "dischargingcurrent", "currentdischarge", "currentdischarging", "dchgcurrent", "dischgcurrent", "idchg", "idis",
+        "idischarge", "entladestrom",
+    ),
     "counter": ("ece",),
     "temperature": (
         "celltemperature", "tcell", "surfacetemperature", "surfacetemperaturet1", "temperature", "temp", "temperaturet1", "auxtemperature1",
@@ -171,3 +177,4 @@ UNITS: dict[str, dict[str, float]] = {
     "degf": 1.0},
 }  # fmt: skip
 UNITS["step_time"], UNITS["counter"] = UNITS["time"], UNITS["voltage"]
+UNITS["charging"] = UNITS["discharging"] = UNITS["current"]

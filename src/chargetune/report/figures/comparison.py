@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from chargetune.battery.baselines.comparison import FEEDBACK, Row
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.report.figures.style import BLUE, GREEN, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, letter, new_figure
-from chargetune.report.figures.trajectories import LABELS, curves, panel_names
+from chargetune.report.figures.trajectories import curves, label_of, panel_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,12 +18,12 @@ __all__ = ["comparison_figure"]
 COLOURS = {
     "plant oracle": GREEN,
     "nominal MPC": BLUE,
-    FEEDBACK: "#000000",
+    FEEDBACK: "#8c564b",
     "tuned": ORANGE,
     "MPC with the true model": "#56B4E9",
     "best constant backoff": "#CC79A7",
 }
-DASHES = ("-", (0, (5, 1)), (0, (3, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)))
+DASHES = ("-", (0, (5, 1)), (0, (3, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2, 1, 2, 1, 2)))
 
 
 def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
@@ -66,7 +66,7 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
             bound = limits.get(name)
             if bound is not None:
                 limit_line = axis.axhline(bound, color=RED, linestyle=(0, (4, 2)), linewidth=0.9, zorder=4)
-            axis.set_ylabel(LABELS[name])
+            axis.set_ylabel(label_of(problem, name))
             if name == "near":
                 limit = problem.voltage_max_V
                 axis.set_ylim(limit - 0.1, limit + 0.1)

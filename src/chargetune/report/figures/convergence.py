@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["convergence_figure", "drawn_limits", "excess_unit", "incumbents", "linear_within", "loss", "worst_excess"]
 
+# A trial without a value has its mark at the foot of the axis.
+WITHOUT_VALUE = ((TrialStatus.FAILED, "failed", "x"), (TrialStatus.APART, "set apart", "|"))
 # Labels as matplotlib sets them.
 TYPESET = {"-G": "$-G$", "mean of (z_d - z)^2": "mean of $(z_d - z)^2$"}
 
@@ -80,15 +82,15 @@ def convergence_figure(view: StudyView) -> Figure:
             upper.plot(at, [words.factor * loss(view, t) for t in trials], label=text, linestyle="none", **style)
             for axis, limit in zip(lowers, limits, strict=False):
                 axis.plot(at, [_excess(limit, t) for t in trials], label=text, linestyle="none", **style)
-        failed = [t.number for t in view.trials if t.status is TrialStatus.FAILED]
-        if failed:
-            # A failed trial has no value, so its mark stands at the foot of the axis.
-            upper.plot(
-                failed, [0.04] * len(failed), "x", color="black", markersize=4, transform=upper.get_xaxis_transform(), label="failed"
-            )
+        foot = []
+        for status, label, mark in WITHOUT_VALUE:
+            at = [t.number for t in view.trials if t.status is status]
+            if at:
+                style = {"marker": mark, "color": "black", "markersize": 4, "linestyle": "none", "label": label}
+                upper.plot(at, [0.04] * len(at), transform=upper.get_xaxis_transform(), **style)
+                foot.append(Line2D([], [], **style))
         handles = [Line2D([], [], linestyle="none", label=text, **style) for text, trials, style in marks if trials]
-        if failed:
-            handles.append(Line2D([], [], linestyle="none", marker="x", color="black", markersize=4, label="failed"))
+        handles += foot
         best = words.factor * incumbents(view)
         if np.isfinite(best).any():
             handles += upper.plot(numbers, best, color=ORANGE, drawstyle="steps-post", label="best so far", zorder=2)

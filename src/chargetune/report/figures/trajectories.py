@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["LABELS", "curves", "episode_figure", "panel_names", "trajectories_figure"]
+__all__ = ["curves", "episode_figure", "label_of", "panel_names", "trajectories_figure"]
 
 LABELS = {
     "soc": "SOC (%)",
@@ -41,6 +41,9 @@ LABELS = {
     "temperature_K": "temperature (K)",
     "anode_potential_V": "anode potential (mV)",
 }
+
+# Of a pack these are of one of its cells.
+EACH = ("current", "voltage")
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -143,8 +146,14 @@ def episode_figure(problem: ChargingProblem, episode: Episode, score: Score | No
                 f"{words.label}: {words.text(-score.objective)} {words.unit}".rstrip()
                 + f", limits {'kept' if score.feasible else 'broken'}",
             )
-        cell_note(figure, problem.cell.name, "; ".join(parts))
+        cell_note(figure, problem.cell.title, "; ".join(parts))
     return figure
+
+
+def label_of(problem: ChargingProblem, name: str) -> str:
+    """The label of a panel's axis; of a pack, whose numbers are those of one cell, it says so."""
+    label = LABELS[name]
+    return label.replace(" (", " per cell (") if problem.cell.pack_line and label.startswith(EACH) else label
 
 
 def panel_names(problem: ChargingProblem) -> list[str]:
@@ -175,7 +184,7 @@ def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, vo
         said = f"at most {peak:.3f} V: nothing came near the limit"
         panels["near"].text(0.5, 0.3, said, transform=panels["near"].transAxes, ha="center", fontsize=7.5, color="0.35")
     for name, axis in panels.items():
-        axis.set_ylabel(LABELS[name])
+        axis.set_ylabel(label_of(problem, name))
         if name != "near":
             axis.autoscale_view()
     for axis in panels.values():

@@ -43,7 +43,7 @@ def theta_figures(view: StudyView, found: Sequence[Importance]) -> str:
         parts.append(paragraph(f"{said}, which this study did not try; the others stay as they are."))
         parts.append('<div class="figures" id="importance"></div>\n')
     parts.append('<div class="figures large" id="parallel"></div>\n<div id="choice" class="tools"></div>\n')
-    parts.append('<div class="figures" id="slices"></div>\n')
+    parts.append('<div class="figures large" id="slices"></div>\n')
     return section("theta", *parts)
 
 
@@ -86,10 +86,9 @@ def certificate(view: StudyView, stated: dict[str, Any] | None) -> str:
     if view.problem is None:
         return ""
     if stated is None:
-        said = (
-            "No certificate of this study was found beside its store. `chargetune certify STORE` makes one: the tuned controller on fresh"
-        )
-        return section("Certificate", paragraph(f"{said} episodes of its range of use, and a bound on the probability of a violation."))
+        how = "The command chargetune certify STORE makes one: the tuned controller on fresh episodes of its range of use"
+        said = f"No certificate of this study was found beside its store. {how}, and a bound on the probability of a violation."
+        return section("Certificate", paragraph(said))
     found, trial = stated["figures"], stated["origin"]["trial"]
     bound = f"{100 * found['violation_probability_upper']:.2f} % (confidence {100 * stated['confidence']:g} %)"
     said = f"Trial {trial} on {found['episodes']} fresh episodes of its range of use: {found['violations']} broke a limit; "

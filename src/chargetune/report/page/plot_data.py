@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.episode import Episode
-from chargetune.report.figures.trajectories import LABELS, curves
+from chargetune.report.figures.trajectories import curves, label_of
 from chargetune.report.figures.tuned_curves import SOC, backoff_values, current_limit_values, resistance_values
 from chargetune.report.study_view import ReadStudy, StudyView
 
@@ -52,10 +52,10 @@ def signals(problem: ChargingProblem | None, episode: Episode, points: int = POI
     out = []
     for key, (x, y) in drawn.items():
         known = [value for value in limits.get(key, []) if value is not None]
-        out.append(_panel(key, LABELS[key], x, y, points, limits=known))
+        out.append(_panel(key, label_of(problem, key), x, y, points, limits=known))
         if key == "voltage_V":
             shown = [highest - NEAR_V[0], highest + NEAR_V[1]]
-            near = _panel("near", LABELS["near"], x[:0], y[:0], points, limits=[highest], shown=shown)
+            near = _panel("near", label_of(problem, "near"), x[:0], y[:0], points, limits=[highest], shown=shown)
             out.append(near | {"of": key})
     return out
 

@@ -151,17 +151,23 @@ const Figures = (() => {
         });
       });
     }
-    const failed = rows.filter((row) => row.status === "failed");
-    if (failed.length) {
+    // Without a value the mark stands at the foot of the axis.
+    for (const [status, name, symbol] of [["failed", "failed", "x-thin-open"], ["apart", "set apart", "line-ns-open"]]) {
+      const without = rows.filter((row) => row.status === status);
+      if (without.length) {
+        data.push({
+          x: without.map((row) => row.number), y: without.map(() => 0.04), name, yaxis: "y99", mode: "markers",
+          marker: { color: colour("ink"), symbol, size: 8 }, hovertemplate: `trial %{x} ${name}<extra></extra>`,
+        });
+      }
+    }
+    const courseOfBest = incumbents(rows, head.objective.larger);
+    if (courseOfBest.some((value) => value !== null)) {
       data.push({
-        x: failed.map((row) => row.number), y: failed.map(() => 0.04), text: failed.map((row) => row.ending), name: "failed", yaxis: "y99",
-        mode: "markers", marker: { color: colour("ink"), symbol: "x-thin-open", size: 8 }, hovertemplate: "trial %{x} failed<extra></extra>",
+        x: rows.map((row) => row.number), y: courseOfBest, name: "best so far", mode: "lines", hoverinfo: "skip",
+        line: { color: colour("tuned"), width: 2, shape: "hv" },
       });
     }
-    data.push({
-      x: rows.map((row) => row.number), y: incumbents(rows, head.objective.larger), name: "best so far", mode: "lines", hoverinfo: "skip",
-      line: { color: colour("tuned"), width: 2, shape: "hv" },
-    });
     const values = rows.map((row) => row.value).filter((value) => value !== null), ends = [-0.02 * rows.length - 0.5, 1.02 * rows.length - 0.5];
     const line = (value, name, dash, ink) => data.push({ x: ends, y: [value, value], name, mode: "lines", hoverinfo: "name", line: { color: colour(ink), width: 1.5, dash } });
     if (head.objective.possible !== null && values.length) line(head.objective.possible, "best possible", "dot", "ink");

@@ -23,8 +23,9 @@
     table.show();
     const entries = shown.map(({ label, colour, dash }) => ({ label, colour, dash }));
     if (others.length) entries.push({ label: `trials (${others.length} shown)`, colour: "trials" });
-    if (where("legend")) Figures.legend(where("legend"), [...entries, { label: "limit", colour: "limit", dash: true }]);
     const first = [...shown.map(({ drawing }) => drawing), ...others].find(({ panels }) => panels.length);
+    const limits = first?.panels.some((panel) => panel.limits.length) ? [{ label: "limit", colour: "limit", dash: true }] : [];
+    if (where("legend")) Figures.legend(where("legend"), [...entries, ...limits]);
     for (const panel of first?.panels || []) {
       add("signals", panel.label, false, (node) => Figures.overTime(node, panel, shown, others));
     }

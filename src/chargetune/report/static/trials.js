@@ -14,7 +14,7 @@ const Trials = (where, rows, choose) => {
   const verdict = (row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken");
   const kinds = {
     all: () => true, kept: (row) => row.feasible === true, "over a limit": (row) => row.feasible === false,
-    failed: (row) => row.status === "failed", running: (row) => row.status === "running", result: (row) => row.number === best,
+    failed: (row) => row.status === "failed", "set apart": (row) => row.status === "apart", running: (row) => row.status === "running", result: (row) => row.number === best,
   };
 
   // The tools above the table: which trials, and whether theta stands in it.
@@ -39,9 +39,11 @@ const Trials = (where, rows, choose) => {
     box.addEventListener("input", () => { theta = box.checked; show(); });
   }
 
+  // What is further than theta and limits stays off paper.
+  const kindOf = (column) => [column.text ? "text" : "", column.further ? "further" : ""].filter(Boolean).join(" ");
   function findColumns() {
-    const metrics = Object.entries(head.metrics).map(([key, [text, unit]]) => ({ key, title: named(text, unit), value: (row) => row.metrics[key] ?? null }));
-    const entries = head.theta.map(({ entry, unit }, i) => ({ key: `theta ${entry}`, name: entry, title: named(entry, unit), theta: true, value: (row) => row.theta[i] }));
+    const metrics = Object.entries(head.metrics).map(([key, [text, unit]]) => ({ key, title: named(text, unit), further: true, value: (row) => row.metrics[key] ?? null }));
+    const entries = head.theta.map(({ entry, unit }, i) => ({ key: `theta ${entry}`, name: entry, title: named(entry, unit), further: head.theta.length > FEW, value: (row) => row.theta[i] }));
     const excesses = head.excesses.map(({ name, label: text, unit }) => ({ key: `excess ${name}`, name, title: named(text, unit), value: (row) => row.excesses[name] ?? null }));
     columns = [
       { key: "number", title: "trial", value: (row) => row.number },
@@ -59,7 +61,7 @@ const Trials = (where, rows, choose) => {
     where("headings").replaceChildren(...columns.map((column) => {
       const heading = document.createElement("th"), button = document.createElement("button");
       heading.scope = "col";
-      heading.className = column.text ? "text" : "";
+      heading.className = kindOf(column);
       heading.dataset.key = column.key;
       button.type = "button";
       button.textContent = column.title;
@@ -80,7 +82,7 @@ const Trials = (where, rows, choose) => {
     line.dataset.number = row.number;
     for (const column of columns) {
       const node = document.createElement("td"), value = column.value(row);
-      node.className = column.text ? "text" : "";
+      node.className = kindOf(column);
       if (column.key === "ending" && String(value).length > 40) node.className = "text long";
       if (value === "broken" || value === "failed") node.classList.add("bad");
       if (column.key === "number" && choose) {

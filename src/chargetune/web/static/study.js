@@ -42,7 +42,8 @@ function newest() {
 }
 
 function wanted() {
-  const list = [{ label: `newest (trial ${newest()})`, colour: "trials", number: newest() }];
+  // Where the newest one is the result it would lie below it.
+  const list = newest() === tuned ? [] : [{ label: `newest (trial ${newest()})`, colour: "trials", number: newest() }];
   list.push({ label: `${startLabel} (trial ${start})`, colour: "untuned", number: start });
   list.push({ label: `${tunedLabel} (trial ${tuned})`, colour: "tuned", number: tuned, dash: tuned === start ? "dash" : "" });
   const [one, other] = chosen;
@@ -92,7 +93,8 @@ async function drawOnce() {
   const asked = Promise.all(entries.map(async (entry) => ({ ...entry, drawing: await drawing(entry.number) })));
   const [drawn] = await Promise.all([asked, plotly]);
   const shown = drawn.filter((entry) => entry.drawing);
-  Figures.legend(where("legend"), [...shown, { label: "limit", colour: "limit", dash: true }]);
+  const limited = shown.some(({ drawing: found }) => found.panels.some((panel) => panel.limits.length));
+  Figures.legend(where("legend"), [...shown, ...(limited ? [{ label: "limit", colour: "limit", dash: true }] : [])]);
   const panels = new Map(), profiles = new Map();
   for (const { drawing: found } of shown) {
     for (const panel of found.panels) if (!panels.has(panel.key)) panels.set(panel.key, panel);
@@ -173,6 +175,7 @@ function tell() {
   const list = [...rows.values()], count = (test) => list.filter(test).length;
   where("counts").textContent = `${list.length} trials: ${count((row) => row.feasible === true)} within the limits, `
     + `${count((row) => row.feasible === false)} beyond one, ${count((row) => row.status === "failed")} failed, `
+    + (count((row) => row.status === "apart") ? `${count((row) => row.status === "apart")} set apart, ` : "")
     + `${count((row) => row.status === "running")} running.`;
 }
 
