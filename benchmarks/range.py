@@ -35,7 +35,7 @@ from chargetune.battery.charging.range_twin import ChargingRangeTwin, RangeCharg
 from chargetune.battery.charging.settings import EstimatorSettings
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
-from chargetune.battery.studies.study_file import load_config
+from chargetune.battery.studies.study_file import TwinTable, load_config
 from chargetune.episode.compiled import compiled_episode
 from chargetune.learning import RangeSettings, RangeTwinSettings, RangeTwinTuner, Safety, TwinSettings
 from chargetune.plants.range_of_use import DrawnPlant
@@ -132,11 +132,11 @@ def fresh(use, seed, count):
     return use.draw(count, int(own[0]) >> 11)
 
 
-def tuner_of(problem, options, seed):
-    """The tuner that learns this problem's cell."""
+def tuner_of(problem, options, seed, spread=0.0):
+    """The tuner that learns this problem's cell, whose circuit is unsure by ``spread`` beside the range."""
     tuned = replace(problem, range=replace(problem.range, **NOTHING)) if "range" in options.without else problem
     start = tuple(options.start) if options.start else None
-    return RangeTwinTuner(ChargingRangeTwin(tuned), seed, Safety(options.probability, start), settings_of(options))
+    return RangeTwinTuner(ChargingRangeTwin(tuned, spread), seed, Safety(options.probability, start), settings_of(options))
 
 
 # A range of one cell, in one condition: what is not given does not differ. Something has to; a thousandth is nothing.
@@ -203,7 +203,7 @@ def rows_dfn(options):
         use = ChargingRange(own)
         plants = fresh(use, cell, options.draws)
         best = oracle(use, plants[: options.oracles])
-        tuner = tuner_of(own, options, options.seeds[0])
+        tuner = tuner_of(own, options, options.seeds[0], TwinTable().resistance_spread)
         yield from learnt(use, RangeCharge(own), tuner, options, best, plants, "DFN, ", range="DFN", plant="DFN", cell=cell)
 
 
