@@ -7,6 +7,8 @@ R1        no trial: theta chosen in simulation on draws of the range, judged on 
 learn     each of ``--cells`` cells of R1: no charge, then one to ``--charges`` charges, each judged on fresh charges of that cell
 crane     examples/range_crane.py, ratio: distance integral to that of a theta tuned for each drawn crane alone
 DFN       examples/range_dfn.toml: limits of voltage, temperature and anode potential on PyBaMM's DFN, after ``--charges`` charges
+structural  the plant of benchmarks/learning_plants.py that no circuit is, from SOC 0.05 to 0.4: the first theta is chosen on the circuits
+          of R1, the controller's model differs from seed to seed
 
 ``--without`` takes one part away: feedback (the estimator is open_loop), range (theta is tuned for the cell as its file has it, judged on
 R1), margin (one search on drawn plants, aim at the whole tolerance), discrepancy (the twin is taken as the plant). The oracle keeps every
@@ -26,14 +28,20 @@ import numpy as np
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
 from chargetune.battery.certification.clopper_pearson import violation_bound
 from chargetune.battery.charging.charging_range import ChargingRange
+from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.evaluate import outcome
+from chargetune.battery.charging.problem import judged_exactly
 from chargetune.battery.charging.range_twin import ChargingRangeTwin, RangeCharge
 from chargetune.battery.charging.settings import EstimatorSettings
+from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
-from chargetune.battery.studies.study_file import load_config
+from chargetune.battery.studies.study_file import TwinTable, load_config
+from chargetune.episode.compiled import compiled_episode
 from chargetune.learning import RangeSettings, RangeTwinSettings, RangeTwinTuner, Safety, TwinSettings
+from chargetune.plants.range_of_use import DrawnPlant
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-ROWS = ("R1", "learn", "crane", "DFN")
+ROWS = ("R1", "learn", "crane", "DFN", "structural")
 WITHOUT = ("feedback", "range", "margin", "discrepancy")
 # A charge of R1 takes at most this at any sampling time.
 LONGEST_S = 2400.0
@@ -124,11 +132,11 @@ def fresh(use, seed, count):
     return use.draw(count, int(own[0]) >> 11)
 
 
-def tuner_of(problem, options, seed):
-    """The tuner that learns this problem's cell."""
+def tuner_of(problem, options, seed, spread=0.0):
+    """The tuner that learns this problem's cell, whose circuit is unsure by ``spread`` beside the range."""
     tuned = replace(problem, range=replace(problem.range, **NOTHING)) if "range" in options.without else problem
     start = tuple(options.start) if options.start else None
-    return RangeTwinTuner(ChargingRangeTwin(tuned), seed, Safety(options.probability, start), settings_of(options))
+    return RangeTwinTuner(ChargingRangeTwin(tuned, spread), seed, Safety(options.probability, start), settings_of(options))
 
 
 # A range of one cell, in one condition: what is not given does not differ. Something has to; a thousandth is nothing.
@@ -152,12 +160,12 @@ def rows_r1(options):
         yield judged(use, theta, plants, best, label, options, **more)
 
 
-def learnt(problem, tuner, options, best, plants, label, **more):
+def learnt(use, run, tuner, options, best, plants, label, **more):
     """A row for no charge, and one for each number of charges, on one cell; on the way each charge's own true excess."""
-    use, run, trials, way, spent = ChargingRange(problem), RangeCharge(problem), [], [], 0.0
+    trials, way, spent = [], [], 0.0
     for number in range(options.charges + 1):
         begin = time.perf_counter()
-        found = tuner.proposed(problem.space, trials)
+        found = tuner.proposed(use.problem.space, trials)
         spent += time.perf_counter() - begin
         # Rows of a plant that takes long are judged after the last charge alone.
         if number == options.charges or not label:
@@ -184,7 +192,7 @@ def rows_learn(options):
         plants = fresh(use, cell, options.draws)
         best = oracle(use, plants[: options.oracles])
         tuner = tuner_of(own, options, options.seeds[0])
-        yield from learnt(own, tuner, options, best, plants, "", range="R1", plant="R-RC", cell=cell)
+        yield from learnt(use, RangeCharge(own), tuner, options, best, plants, "", range="R1", plant="R-RC", cell=cell)
 
 
 def rows_dfn(options):
@@ -195,8 +203,56 @@ def rows_dfn(options):
         use = ChargingRange(own)
         plants = fresh(use, cell, options.draws)
         best = oracle(use, plants[: options.oracles])
-        tuner = tuner_of(own, options, options.seeds[0])
-        yield from learnt(own, tuner, options, best, plants, "DFN, ", range="DFN", plant="DFN", cell=cell)
+        tuner = tuner_of(own, options, options.seeds[0], TwinTable().resistance_spread)
+        yield from learnt(use, RangeCharge(own), tuner, options, best, plants, "DFN, ", range="DFN", plant="DFN", cell=cell)
+
+
+class _Structural:
+    """Charges of one structural plant from starts that are drawn, with the methods of `ChargingRange` that a row needs."""
+
+    def __init__(self, problem):
+        self.problem, self._exact = problem, judged_exactly(problem)
+        self._loop = compiled_episode(controller_of(problem), self._at(problem.episode.soc_start), problem.episode.steps)
+
+    def _at(self, soc):
+        return self.problem.plant.plant(soc, self.problem.controller.sampling_time_s, self.problem.sensors.sensors())
+
+    def draw(self, count, seed):
+        stream = np.random.default_rng([seed, 3])
+        starts, seeds = stream.uniform(*self.problem.range.soc_start, count), stream.integers(2**53, size=count)
+        return [DrawnPlant(self._at(float(soc)), int(one)) for soc, one in zip(starts, seeds, strict=True)]
+
+    def plant_of(self, drawn):
+        return drawn.plant
+
+    def run(self, thetas, plants):
+        return self._loop.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants])
+
+    def score(self, episode):
+        return score_episode(self._exact, episode, soc_start=float(episode.signal("soc")[0][0]))
+
+    def charge(self, theta, seed):
+        (episode,) = self.run([theta], self.draw(1, seed))
+        return outcome(self.problem, episode, soc_start=float(episode.signal("soc")[0][0]))
+
+
+def rows_structural(options):
+    """A plant that is none of the range: its own discrepancy is what there is to learn."""
+    from learning_plants import StructuralPlant
+
+    problem = r1(options)
+    for seed in options.seeds:
+        own = replace(
+            problem,
+            plant=StructuralPlant(problem.cell),
+            controller=replace(problem.controller, mismatch_seed=seed),
+            range=replace(problem.range, soc_start=(0.05, 0.4)),
+        )
+        use = _Structural(own)
+        plants = fresh(use, seed, options.draws)
+        best = oracle(use, plants[: options.oracles])
+        tuner = tuner_of(own, options, seed)
+        yield from learnt(use, use.charge, tuner, options, best, plants, "", range="R1, start 0.05 to 0.4", plant="structural", seed=seed)
 
 
 def rows_crane(options):
@@ -267,7 +323,7 @@ def main():
     parser.add_argument("--start", type=float, nargs="+", help="theta of the row R1, to leave that search out of others")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    tables = {"R1": rows_r1, "learn": rows_learn, "crane": rows_crane, "DFN": rows_dfn}
+    tables = {"R1": rows_r1, "learn": rows_learn, "crane": rows_crane, "DFN": rows_dfn, "structural": rows_structural}
     rows = []
     for name in options.rows:
         for row in tables[name](options):

@@ -2,7 +2,8 @@
 
 Run: python examples/electrochemical_cell.py FOLDER. A slow cycle gives the open-circuit voltage, a pulse test at 298 K the
 circuit, pulse tests at two more temperatures how its resistance falls when it warms, and one charge its heat capacity and
-cooling: `okane2022.toml`. A slow charge more, with a reference electrode, gives the anode potential too: `okane2022_anode.toml`.
+cooling: `okane2022.toml`. A slow charge more, with a reference electrode, gives the anode potential too: `okane2022_anode.toml`. For a
+range of ambient temperatures it takes charges at its ends, and more nodes: `okane2022_range.toml`.
 """
 
 import sys
@@ -58,5 +59,16 @@ cell = replace(
 print(f"E = {energy:.0f} J/mol, C = {cell.thermal.heat_capacity_J_K:.1f} J/K, hA = {cell.thermal.cooling_W_K:.4f} W/K")
 slow = charge(bench(298.15, 60.0, 0.02), constant_current(1.0), [limit], steps=300, soc_target=1.0, current_max_A=1.0)
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
-for name, one in (("okane2022.toml", cell), ("okane2022_anode.toml", with_anode(cell, [slow, run]))):
+# Current A, seconds a sample, samples, SOC at the end: where the anode plates while it is cold is what the table has to tell.
+charges = [
+    charge(bench(ambient, seconds, 0.03), constant_current(current), [limit], steps=steps, soc_target=end, current_max_A=current)
+    for ambient in (278.15, 298.15, 308.15)
+    for current, seconds, steps, end in ((1.0, 60.0, 300, 0.98), (5.0, 20.0, 196, 0.85), (8.0, 20.0, 122, 0.85))
+]
+files = {
+    "okane2022.toml": cell,
+    "okane2022_anode.toml": with_anode(cell, [slow, run]),
+    "okane2022_range.toml": with_anode(cell, charges, nodes=30),
+}
+for name, one in files.items():
     (folder / name).write_text(cell_toml(one), encoding="utf-8")

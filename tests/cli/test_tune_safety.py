@@ -10,6 +10,7 @@ from commands import run
 
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.evaluate import evaluate
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.studies.open_study import make_tuner
 from chargetune.battery.studies.study_file import load_config
@@ -122,5 +123,8 @@ def test_tune_says_which_trial_is_the_result_and_why(capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "the result is trial 1: the tuner believes it best from all traces" in said
     assert "theta of trial 1:" in said
-    _closing(problem, trials, StudyResult(trials[0], Reason.MEASURED))
-    assert "the result is trial 0: it is the best that was measured" in " ".join(capsys.readouterr().out.split())
+    assert said.endswith("a table [range] in the study file tunes it for all of them")
+    _closing(replace(problem, range=ChargingRangeSettings(resistance=0.1)), trials, StudyResult(trials[0], Reason.MEASURED))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the result is trial 0: it is the best that was measured" in said
+    assert "this theta holds for the cell and the start" not in said

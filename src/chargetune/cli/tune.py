@@ -38,6 +38,10 @@ from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["bar", "tune_command"]
 
+# Said of a result that `chargetune certify` will mostly find to break its limits.
+ONE_CELL = """this theta holds for the cell and the start that it was tuned on, others may
+break its limits; a table [range] in the study file tunes it for all of them"""
+
 
 def bar(*, quiet: bool) -> Progress:
     """A progress bar on stderr, so that a program can read stdout. At 80 columns the note is what goes on in a second line."""
@@ -271,6 +275,8 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
     screen.print(result_line(result), markup=False, soft_wrap=True)
     screen.print(f"theta of trial {best.number}:\n{theta_lines(problem.space.entries, units, best.theta)}")
+    if problem.range is None:
+        screen.print(ONE_CELL, style="dim", markup=False, soft_wrap=True)
 
 
 def _summary(config: Config, problem: ChargingProblem, trials: list[Trial], result: StudyResult) -> dict[str, Any]:

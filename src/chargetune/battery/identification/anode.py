@@ -15,22 +15,25 @@ from chargetune.episode.episode import Episode
 
 __all__ = ["with_anode"]
 
-# SOC nodes of the table within the SOC that were visited.
+# SOC nodes of the table within the SOC that were visited, unless told: two charges tell about as many apart.
 NODES = 12
 # Currents that differ by less than this share tell potential and resistance no longer apart.
 APART = 0.3
 
 
-def with_anode(cell: Cell, charges: Sequence[Episode]) -> Cell:
+def with_anode(cell: Cell, charges: Sequence[Episode], nodes: int = NODES) -> Cell:
     """The cell with an anode table, from charges with the measured outputs soc and anode_potential_V, one of them slow.
 
     The tables are the least-squares solution, with piecewise linear U and r >= 0 over SOC, of
 
         phi = U(z) - r(z) s(T) I
 
-    at the end of every interval; s(T) is the resistance factor of the cell's ``thermal`` data, 1 without them. Beyond the SOC that
-    were visited the outer values hold. Raises ValueError when an output is missing, or the currents do not tell U from r.
+    at the end of every interval, with ``nodes`` of the SOC that were visited; s(T) is the resistance factor of the cell's ``thermal``
+    data, 1 without them. Beyond the SOC that were visited the outer values hold. Raises ValueError when an output is missing, the
+    currents do not tell U from r, or ``nodes`` is not an integer >= 2.
     """
+    if isinstance(nodes, bool) or not isinstance(nodes, int) or nodes < 2:
+        raise ValueError(f"anode: nodes = {nodes!r}, allowed is an integer >= 2")
     columns: list[NDArray[np.float64]] = []
     thermal = cell.thermal
     for number, charge in enumerate(charges):
@@ -54,17 +57,17 @@ def with_anode(cell: Cell, charges: Sequence[Episode]) -> Cell:
             f"largest currents of the {len(columns)} charges (times the resistance factor): {', '.join(f'{v:.3g}' for v in largest)} A; "
             f"to tell potential from resistance in [anode] one charge needs at most {1 - APART:.1f} of another's"
         )
-    nodes = np.linspace(float(z.min()), float(z.max()), NODES)
-    hats = np.stack([np.interp(z, nodes, unit) for unit in np.eye(NODES)], axis=1)
-    low, high = np.repeat([-np.inf, 0.0], NODES), np.full(2 * NODES, np.inf)
+    at = np.linspace(float(z.min()), float(z.max()), nodes)
+    hats = np.stack([np.interp(z, at, unit) for unit in np.eye(nodes)], axis=1)
+    low, high = np.repeat([-np.inf, 0.0], nodes), np.full(2 * nodes, np.inf)
     found = lsq_linear(np.hstack([hats, -flow[:, None] * hats]), phi, bounds=(low, high)).x
-    start, end = [0.0] if nodes[0] > 0 else [], [1.0] if nodes[-1] < 1 else []
+    start, end = [0.0] if at[0] > 0 else [], [1.0] if at[-1] < 1 else []
     outer = (len(start), len(end))
     return replace(
         cell,
         anode=Anode(
-            soc=(*start, *(float(v) for v in np.clip(nodes, 0.0, 1.0)), *end),
-            potential_V=tuple(float(v) for v in np.pad(found[:NODES], outer, mode="edge")),
-            resistance_ohm=tuple(float(v) for v in np.pad(found[NODES:], outer, mode="edge")),
+            soc=(*start, *(float(v) for v in np.clip(at, 0.0, 1.0)), *end),
+            potential_V=tuple(float(v) for v in np.pad(found[:nodes], outer, mode="edge")),
+            resistance_ohm=tuple(float(v) for v in np.pad(found[nodes:], outer, mode="edge")),
         ),
     )
