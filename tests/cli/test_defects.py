@@ -16,7 +16,7 @@ def raising(monkeypatch, chargetune_here, tmp_path):
             def __init__(self, *_, **__):
                 action()
 
-        monkeypatch.setattr("chargetune.cli.show.Store", Opened)
+        monkeypatch.setattr("chargetune.report.study_view.Store", Opened)
         return chargetune_here("show", tmp_path / "s.sqlite")
 
     return run

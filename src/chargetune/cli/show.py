@@ -97,6 +97,7 @@ def _show_trials(view: StudyView) -> None:
         verdict = ("kept" if s.feasible else "[red]broken[/]") if s else "-"
         table.add_row(str(t.number), "*" if best is not None and t.number == best.number else "", t.status.value, *cells, verdict)
     screen = console()
+    screen.print(f"study {view.name}", markup=False)
     screen.print(table)
     if limits:
         said = (

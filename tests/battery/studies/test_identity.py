@@ -134,7 +134,7 @@ REFUSED = [
     ("[limits]\nhard = 'voltage_max_V'", "limits.hard = 'voltage_max_V', allowed is a list"),
     (
         "[limits]\nhard = ['anode_min_V']",
-        "limits: hard names ['anode_min_V'], allowed are the limits that are set: voltage_max_V, voltage_min_V",
+        "limits: hard names anode_min_V, allowed are the limits that are set: voltage_max_V, voltage_min_V",
     ),
     ("[sensors]\nvoltage_noise_sd_V = -1.0", "sensors: voltage_noise_sd_V = -1.0, allowed is [0, 0.5] V (was it given in mV?)"),
     ("[theta.R0]\nlower = 2.0", "theta.R0: resistance ratio: lower = 2.0, allowed is [0.001, 0.999]"),
