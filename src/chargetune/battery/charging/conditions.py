@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from chargetune.battery.validation import check_count, check_number
+from chargetune.battery.validation import check_count, check_interval, check_number
 from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.model.schedule import Axis, Schedule
@@ -44,13 +44,8 @@ class Over:
         ):
             check_count(f"over: {nodes}", getattr(self, nodes), 2, 20)
             pair = getattr(self, name)
-            if pair is None:
-                continue
-            if len(pair) != 2:
-                raise ValueError(f"over: {name} = {list(pair)}, allowed is [lowest, highest]")
-            low, high = (check_number(f"over: {name}[{k}]", value, least, most, unit) for k, value in enumerate(pair))
-            if low >= high:
-                raise ValueError(f"over: {name} = {list(pair)}, allowed is [lowest, highest] with lowest < highest")
+            if pair is not None:
+                check_interval(f"over: {name}", pair, least, most, unit, wide=True)
 
     @property
     def shape(self) -> tuple[int, int]:

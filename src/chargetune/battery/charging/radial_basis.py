@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from chargetune.battery.validation import check_count, check_number
+from chargetune.battery.validation import check_count, check_interval, check_number
 from chargetune.control.controller import Stage
 from chargetune.model.parameter_space import Parameter
 
@@ -52,11 +52,7 @@ class RadialBasis:
         check_count("rbf: soc_nodes", self.soc_nodes, 2, RBF_MAX)
         check_count("rbf: voltage_nodes", self.voltage_nodes, 2, RBF_MAX)
         if self.voltage_V is not None:
-            if len(self.voltage_V) != 2:
-                raise ValueError(f"rbf: voltage_V = {list(self.voltage_V)}, allowed is [lowest, highest]")
-            low, high = (check_number(f"rbf: voltage_V[{k}]", value, 0.0, 10.0, "V") for k, value in enumerate(self.voltage_V))
-            if low >= high:
-                raise ValueError(f"rbf: voltage_V = {list(self.voltage_V)}, allowed is [lowest, highest] with lowest < highest")
+            check_interval("rbf: voltage_V", self.voltage_V, 0.0, 10.0, "V", wide=True)
         check_number("rbf: lower", self.lower, -10.0, 0.0)
         check_number("rbf: upper", self.upper, 0.0, 10.0, open_low=True)
 

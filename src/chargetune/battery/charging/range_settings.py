@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from chargetune.battery.validation import check_number
+from chargetune.battery.validation import check_interval, check_number
 
 __all__ = ["MEANING", "NOT_ELECTROCHEMICAL", "ChargingRangeSettings", "range_line"]
 
@@ -88,13 +88,8 @@ class ChargingRangeSettings:
             raise ValueError(f"range: cell = {self.cell!r}, allowed is an integer >= 0")
         for name, least, most, unit in (("soc_start", 0.0, 1.0, ""), ("ambient_K", 200.0, 400.0, "K")):
             pair = getattr(self, name)
-            if pair is None:
-                continue
-            if len(pair) != 2:
-                raise ValueError(f"range: {name} = {list(pair)!r}, allowed is [lowest, highest]")
-            low, high = (check_number(f"range: {name}[{k}]", value, least, most, unit) for k, value in enumerate(pair))
-            if low > high:
-                raise ValueError(f"range: {name} = {list(pair)!r}, allowed is [lowest, highest]")
+            if pair is not None:
+                check_interval(f"range: {name}", pair, least, most, unit)
 
     @property
     def entries(self) -> dict[str, float | list[float] | None]:
