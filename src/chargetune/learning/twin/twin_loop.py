@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -10,21 +10,13 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.learning.closed_loop.loop import JudgedLoop
-from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.discrepancy import DiscrepancySample
 from chargetune.learning.twin.twin import Twin
 
-__all__ = ["Member", "ModelledLoop", "TracedTrial", "TwinLoop"]
+__all__ = ["Member", "ModelledLoop", "TwinLoop"]
 
 Member = tuple[NDArray[np.float64], NDArray[np.float64], DiscrepancySample | None]
 """One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
-
-
-class TracedTrial(TrialLike, Protocol):
-    """A trial whose measured episode can be read; None when it has none."""
-
-    @property
-    def episode(self) -> Callable[[], Episode | None] | None: ...
 
 
 class ModelledLoop(Protocol):
