@@ -11,9 +11,11 @@ from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.evaluate import evaluate, run_charge
+from chargetune.battery.charging.problem import stand_in
 from chargetune.battery.charging.tunables import Backoff, LimitBackoff, ResistanceRatio
 from chargetune.battery.charging.twin_loop import ChargingTwin
 from chargetune.battery.charging.verdict import score_episode
+from chargetune.battery.plants.circuit import Circuit
 from chargetune.episode.episode import Ending
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.learning import Safety, TwinTuner
@@ -51,6 +53,13 @@ class AnotherCell:
 
     def plant(self, soc_start, sampling_time_s, sensors):
         return SimulatedPlant(ecm_model(self.cell, sampling_time_s), start_state(self.cell, soc_start), sensors)
+
+
+@dataclass(frozen=True)
+class Chamber:
+    """A plant that is no circuit, of which the ambient is known."""
+
+    ambient_K: float
 
 
 def charge(seed=1, noise=0.002, **changes):
@@ -145,6 +154,21 @@ def test_the_controller_reads_what_the_twin_cannot_represent():
 
 
 @pytest.mark.usefixtures("virtual_machine")
+def test_the_twin_is_charged_at_the_ambient_of_the_plant():
+    """In a cold chamber a twin with the plant's circuit does what the plant does: the controller's own ambient is another."""
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=45.0, cooling_W_K=0.1, activation_J_mol=20e3))
+    cold = replace(warm, thermal=replace(warm.thermal, ambient_K=278.15))
+    problem = charging_problem(warm, mismatch_seed=None, plant=Circuit(cold), steps=120, temperature_max_K=305.0, R0=ResistanceRatio())
+    loop, theta = ChargingTwin(problem), problem.space.default
+    (predicted,) = loop.simulate([(theta, np.zeros(27), None)])
+    measured = run_charge(problem, theta)
+    assert measured.signal("temperature_K")[0][0] == 278.15
+    for name in ("voltage_V", "temperature_K"):
+        np.testing.assert_allclose(predicted.signal(name)[1], measured.signal(name)[1], rtol=0, atol=1e-6)
+    assert loop.features["temperature_K"][0] == 278.15
+    assert stand_in(replace(problem, plant=Chamber(278.15))).plant_cell == cold
+
+
 def test_only_what_was_not_measured_has_no_verdict():
     problem = charge(steps=120)
     loop, episode = ChargingTwin(problem), run_charge(problem, problem.space.default, 0)

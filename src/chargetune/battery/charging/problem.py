@@ -321,7 +321,7 @@ def judged_exactly(problem: ChargingProblem) -> ChargingProblem:
 def stand_in(problem: ChargingProblem) -> ChargingProblem:
     """The problem on the cell's own circuit with exact sensors: a check runs hundreds of charges and never touches a real plant.
 
-    Limits of signals that the circuit does not have are left out.
+    Its ambient is that of the plant. Limits of signals that the circuit does not have are left out.
     """
     problem = replace(judged_exactly(problem), safety=None, range=None)
     if problem.plant is None:
@@ -335,4 +335,7 @@ def stand_in(problem: ChargingProblem) -> ChargingProblem:
         hard=tuple(name for name in limits.hard if name not in absent),
         scored_only=tuple(name for name in limits.scored_only if name not in absent),
     )
-    return replace(problem, plant=None, limits=limits)
+    ambient, plant = problem.context.get("ambient_K"), None
+    if cell.thermal and ambient is not None and ambient != cell.thermal.ambient_K:
+        plant = Circuit(replace(cell, thermal=replace(cell.thermal, ambient_K=ambient)))
+    return replace(problem, plant=plant, limits=limits)

@@ -61,13 +61,22 @@ class ChargingTwin:
         problem = self.problem
         belief = problem.controller_cell
         circuit = ecm_model(problem.cell, problem.controller.sampling_time_s)
-        model = circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables})
+        ambient = {} if self.ambient_K is None else {"ambient_K": self.ambient_K}
+        model = circuit.with_parameters(**{n: getattr(belief, n) for n in belief.tables}, **ambient)
         unknowns = [Uncertain(name, self.spread, smooth=self.smooth) for name in belief.tables]
         unknowns += [Uncertain("capacity_Ah", self.capacity_spread)] if self.capacity_spread else []
         unknowns += [Uncertain("soc", self.soc_spread, "start")] if self.soc_spread else []
         unknowns += [Uncertain("voltage_V", self.ocv_spread_V, "bias")] if self.ocv_spread_V else []
-        start = start_state(belief, problem.episode.soc_start)
+        start = start_state(belief, problem.episode.soc_start) | ({} if self.ambient_K is None else {"temperature_K": self.ambient_K})
         return Twin(model, tuple(unknowns), self.noise_sd, start, self.error_sd, self.error_at_rest)
+
+    @property
+    def ambient_K(self) -> float | None:
+        """Of the study's charges, also the cell's at their start; None for a cell without a temperature.
+
+        It is what the study declares of its plant, as a chamber's operator knows it; the controller's own model keeps that of its cell.
+        """
+        return self.problem.context["ambient_K"] if self.problem.cell.thermal else None
 
     @property
     def noise_sd(self) -> dict[str, float]:
@@ -93,9 +102,8 @@ class ChargingTwin:
         """What the circuit's error depends on: SOC, current and, where it is measured, temperature."""
         problem = self.problem
         ranges = {"soc": (0.0, 1.0), "current_A": (problem.limits.current_min_A, problem.current_max_A)}
-        thermal = problem.cell.thermal
-        if thermal:
-            ranges["temperature_K"] = (thermal.ambient_K, (problem.limits.temperature_max_K or thermal.ambient_K + 30.0) + 5.0)
+        if self.ambient_K is not None:
+            ranges["temperature_K"] = (self.ambient_K, (problem.limits.temperature_max_K or self.ambient_K + 30.0) + 5.0)
         return ranges
 
     @property
