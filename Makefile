@@ -30,8 +30,10 @@ $(READY): requirements.lock pyproject.toml
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-demo: $(READY) ## tune a fast-charging controller and draw the figures, into out/demo
-	$(BIN)/chargetune tune examples/fast_charge.toml --out out/demo
+demo: $(READY) ## five safe charges of an electrochemical cell in the cold, beside other ways to charge it; figures in out/demo
+	$(BIN)/chargetune tune examples/demo.toml --out out/demo
+	$(BIN)/chargetune compare examples/demo.toml --store out/demo/study.sqlite --figure out/demo/compare.png --overwrite \
+	  --row 'CC-CV that keeps all limits' --row 'nominal MPC' --row tuned --row 'plant oracle'
 
 test: lint types tests imports ## every check and every test
 

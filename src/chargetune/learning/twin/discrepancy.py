@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -93,28 +93,21 @@ class Discrepancy:
         return LookupTable.over(self.features, list(self.posterior.twin.noise_sd))
 
     def at(self, episode: Episode) -> NDArray[np.float64]:
-        """Mean features of every bin, shape (bins, features)."""
+        """Mean features of every bin of a measured episode, shape (bins, features)."""
         return binned_residuals(self.signals(episode), self.settings.bins)[0]
 
     def signals(self, episode: Episode) -> NDArray[np.float64]:
-        """Features at both ends of every interval, shape (intervals, 2, features).
+        """Features of a measured episode at both ends of every interval, shape (intervals, 2, features).
 
-        Where one was not measured it is what the twin predicts, and where the twin does not, what lies between its neighbours.
+        An output that the twin predicts is told as its mode has it under the recorded inputs, also where it was measured: a sample is
+        looked up at what a plant of the ensemble predicts before its own error is added. What was not measured of the others lies
+        between its neighbours.
         """
-        out = np.stack([np.stack(_feature(episode, name), axis=1) for name in self.features], axis=2)
-        if np.all(np.isfinite(out)):
-            return out
-        twin = self.posterior.twin.under(episode)
-        predicted = dict(zip(twin.noise_sd, np.moveaxis(predict(twin, self.posterior.mode, episode.input), -1, 0), strict=True))
-        for i, name in enumerate(self.features):
-            seen = np.isfinite(out[..., i])
-            if not seen.any() and name not in predicted:
-                raise ValueError(f"discrepancy: {name} was never measured in an episode of {len(episode)} intervals")
-            time = np.arange(seen.size).reshape(seen.shape)
-            out[..., i] = np.where(
-                seen, out[..., i], predicted[name] if name in predicted else np.interp(time, time[seen], out[..., i][seen])
-            )
-        return out
+        twin, predicted = self.posterior.twin.under(episode), {}
+        if set(self.features) & set(twin.noise_sd):
+            values = np.moveaxis(predict(twin, self.posterior.mode, episode.input), -1, 0)
+            predicted = dict(zip(twin.noise_sd, values, strict=True))
+        return _features(episode, self.features, predicted)
 
     def _residuals(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean residual of every bin, shape (n, outputs), after the first axes of ``unknowns``; 0 where nothing was measured."""
@@ -175,7 +168,7 @@ class DiscrepancySample:
         """A predicted episode -> the same with this added to its outputs."""
         lookup_table = self.discrepancy.lookup_table
         columns = [episode.output_names.index(name) for name in lookup_table.outputs]
-        at = self.discrepancy.signals(episode)
+        at = _features(episode, self.discrepancy.features)
         changed = []
         for k, outputs in enumerate((episode.output_start, episode.output_end)):
             out = outputs.copy()
@@ -286,8 +279,22 @@ def _part(prior: NDArray[np.float64], variance: NDArray[np.float64], weights: ND
     return _Part(cho_solve(seen, cross).T, prior, cross, noise, weights)
 
 
-def _feature(episode: Episode, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if name in episode.input_names:
-        held = episode.input[:, episode.input_names.index(name)]
-        return held, held
-    return episode.signal(name)
+def _features(episode: Episode, names: Iterable[str], predicted: Mapping[str, NDArray[np.float64]] | None = None) -> NDArray[np.float64]:
+    """Signals at both ends of every interval, shape (intervals, 2, names): as predicted, else as the episode has them, bridged."""
+
+    def one(name: str) -> NDArray[np.float64]:
+        if predicted and name in predicted:
+            return predicted[name]
+        if name in episode.input_names:
+            out = np.repeat(episode.input[:, [episode.input_names.index(name)]], 2, axis=1)
+        else:
+            out = np.stack(episode.signal(name), axis=1)
+        seen = np.isfinite(out)
+        if seen.all():
+            return out
+        if not seen.any():
+            raise ValueError(f"discrepancy: {name} was never measured in an episode of {len(episode)} intervals")
+        time = np.arange(seen.size).reshape(seen.shape)
+        return np.asarray(np.where(seen, out, np.interp(time, time[seen], out[seen])))
+
+    return np.stack([one(name) for name in names], axis=2)
