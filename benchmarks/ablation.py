@@ -22,8 +22,6 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "its scales": {"scale_share": 0.5},
     # Residuals of neighbouring bins are told to be independent.
     "correlated bins": {"correlated_bins": 1.0},
-    # One fit with a discrepancy taken from residuals, instead of two.
-    "refits": {"refits": 1},
     "older traces": {"traces": 1},
     # What is not needed may move.
     "proximal": {"proximal": 0.0},
@@ -34,7 +32,6 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "aim": {"aim": 1.0},
     # Fewer plants judge than the candidates were chosen by.
     "judges": {"judges": 16},
-    "pool": {"pool": 1},
     "steps back": {"steps_back": (0.25,)},
 }
 

@@ -11,7 +11,7 @@ import pytest
 from chargetune.learning.twin.settings import TwinSettings
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-FEW = TwinSettings(plants=16, judges=32, rounds=3, pool=8)
+FEW = TwinSettings(plants=16, judges=32, rounds=3)
 KEYS = {
     "method", "plant", "study", "noise_mV", "trials", "solved", "of", "t95_ratio_median", "t95_ratio_worst",
     "violating_trials", "all_trials", "worst_excess_mV", "ask_s_median",

@@ -27,7 +27,7 @@ from charging_problems import changed, charging_problem
 
 CELL = default_cell()
 # A quarter of the plants, half the rounds: a study takes a third of the time, and what is asserted of it has room.
-FEW = TwinSettings(plants=16, judges=32, rounds=3, pool=8)
+FEW = TwinSettings(plants=16, judges=32, rounds=3)
 # One hour instead of two: a charge whose time counts takes 35 to 50 min.
 HOUR = 360
 

@@ -29,7 +29,7 @@ __all__ = ["NegativeLogPosterior", "fit"]
 
 # Tolerances of the least squares: a change of the loss, or of the unknowns, by less is not worth another evaluation.
 FTOL, XTOL, EVALUATIONS = 1e-6, 1e-5, 30
-# The same of the first fit of several, of which only the size of the residuals is used: with noise alone a plant of another kind has a
+# The same of the first of two fits, of which only the size of the residuals is used: with noise alone a plant of another kind has a
 # long valley, and the size is known to a percent long before its end.
 FTOL_FIRST = 1e-4
 # Relative change of the sd of a sample after which no other fit is worth it.
@@ -46,7 +46,7 @@ def fit(
 ) -> Posterior:
     """The posterior from the measured outputs of these episodes; samples that are not finite are left out.
 
-    With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and the fit is repeated with the variance that
+    With ``discrepancy`` the residuals at the mode say how much the model cannot represent, and a second fit has the variance that
     this adds. Where the means of whole bins are not zero, neighbouring residuals have one cause, and all samples of as many bins as
     are correlated count as one. ``start`` is the posterior of most of these episodes, at whose mode the search begins. Without episodes
     the result is the prior.
@@ -57,9 +57,9 @@ def fit(
     e = np.zeros(twin.score_count) if start is None else start.scores[0]
     # The sd of a sample begins at the noise each time: taken over from fit to fit, mode and sd would follow each other.
     spread, unmodelled = noise, np.zeros(len(noise))
-    for k in range(1 + settings.refits):
+    for second in (False, True):
         loss = NegativeLogPosterior(twin, data, spread)
-        ftol = FTOL if k or not (data and discrepancy) else FTOL_FIRST
+        ftol = FTOL if second or not (data and discrepancy) else FTOL_FIRST
         found = least_squares(loss.values, e, jac=loss.slopes, method="trf", x_scale=1.0, max_nfev=EVALUATIONS, ftol=ftol, xtol=XTOL)
         e = np.asarray(found.x, dtype=np.float64)
         if not (data and discrepancy):
@@ -67,7 +67,7 @@ def fit(
         residuals = [y - predict(own, twin.unknowns_at(e), u) for own, u, y in data]
         unmodelled, following = _unmodelled(residuals, noise, settings)
         # Mode, covariance and the sd of a sample belong to one fit.
-        if k == settings.refits or np.allclose(following, spread, rtol=SAME):
+        if second or np.allclose(following, spread, rtol=SAME):
             break
         spread = following
     # Eigenvalues of J'J, which is small, instead of singular values of J, which is long.

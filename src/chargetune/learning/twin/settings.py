@@ -17,8 +17,6 @@ class TwinSettings:
         Stretches of an episode over which residuals are averaged. What a model cannot represent changes slowly.
     correlated_bins
         Neighbouring bins that err together, so that as many count as one.
-    refits
-        Fits with a discrepancy taken from the residuals of the one before; after the second it changes by less than a tenth.
     length_scales, length_scale_sd
         Prior medians of the discrepancy's length scales, as shares of each feature's range, and the sd of their logarithms. The first
         feature is the one along which the plant moves (a state of charge): its scale is short.
@@ -43,8 +41,6 @@ class TwinSettings:
         Of the search in one round, and the share of the objective that an iteration has to win. A measured time is worth no more.
     proximal
         Share of the objective that moving one entry of theta over its whole range has to win: what is not needed stays as it was tried.
-    pool
-        Sobol points from which a search may begin beside the thetas that were tried.
     steps_back
         Shares of the way from a safe theta to one that is not, tried in this order.
     """
@@ -52,7 +48,6 @@ class TwinSettings:
     traces: int = 4
     bins: int = 40
     correlated_bins: float = 4.0
-    refits: int = 2
     length_scales: tuple[float, ...] = (0.15, 0.5, 0.5)
     length_scale_sd: float = 0.5
     scale_sd: float = 1.0
@@ -66,11 +61,10 @@ class TwinSettings:
     iterations: int = 15
     gain: float = 1e-3
     proximal: float = 1e-3
-    pool: int = 32
     steps_back: tuple[float, ...] = (0.8, 0.5, 0.25)
 
     def __post_init__(self) -> None:
-        for name in ("traces", "bins", "refits", "plants", "judges", "rounds", "iterations", "pool"):
+        for name in ("traces", "bins", "plants", "judges", "rounds", "iterations"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is an integer >= 1")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from chargetune.battery.baselines.comparison import FEEDBACK, Row
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.report.figures.style import BLUE, GREEN, GREY, ORANGE, PAGE_IN, RED, cell_note, journal_style, letter, new_figure
-from chargetune.report.figures.trajectories import curves, label_of, panel_names
+from chargetune.report.figures.trajectories import curves, label_of, near_lower, panel_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ DASHES = ("-", (0, (5, 1)), (0, (3, 1)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8,
 def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
     """SOC, current, voltage and every further limited signal over time; the red line is the limit."""
     names = [name for name in panel_names(problem) if name != "near"]
-    if len(names) < 4:
+    if len(names) % 2:
         names.append("near")
     limits = {
         "current_A": problem.current_max_A,
@@ -70,6 +70,8 @@ def comparison_figure(problem: ChargingProblem, rows: Sequence[Row]) -> Figure:
             if name == "near":
                 limit = problem.voltage_max_V
                 axis.set_ylim(limit - 0.1, limit + 0.1)
+            if name == "anode_potential_V" and bound is not None:
+                near_lower(axis, bound)
         for axis in axes[max(len(names) - 2, 0) : len(names)]:
             axis.set_xlabel("time (min)")
             axis.tick_params(labelbottom=True)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-__all__ = ["curves", "episode_figure", "label_of", "panel_names", "trajectories_figure"]
+__all__ = ["curves", "episode_figure", "label_of", "near_lower", "panel_names", "trajectories_figure"]
 
 LABELS = {
     "soc": "SOC (%)",
@@ -162,6 +162,12 @@ def panel_names(problem: ChargingProblem) -> list[str]:
     return ["soc", "current_A", "voltage_V", "near", *(name for name, limit in further.items() if limit is not None)]
 
 
+def near_lower(axis: Axes, bound_mV: float) -> None:
+    """The anode potential near its limit: at the start of a charge it is some 300 mV higher, and nothing would be seen of the rest."""
+    low, high = axis.get_ylim()
+    axis.set_ylim(min(low, bound_mV - 10.0), min(high, bound_mV + 100.0))
+
+
 def _limits(panels: dict[str, Axes], problem: ChargingProblem) -> list[Line2D]:
     style: dict[str, Any] = {"color": RED, "linestyle": (0, (4, 2)), "linewidth": 0.9, "label": "limit", "zorder": 4}
     limits = {
@@ -187,6 +193,8 @@ def _frame(figure: Figure, panels: dict[str, Axes], problem: ChargingProblem, vo
         axis.set_ylabel(label_of(problem, name))
         if name != "near":
             axis.autoscale_view()
+        if name == "anode_potential_V" and problem.limits.anode_min_V is not None:
+            near_lower(axis, 1e3 * problem.limits.anode_min_V)
     for axis in panels.values():
         axis.tick_params(labelbottom=True)
     for axis in list(panels.values())[-2:]:
