@@ -67,7 +67,7 @@ def test_a_repeat_says_nothing_of_elsewhere():
 def test_repeats_do_not_make_what_was_learnt_of_the_scale_forgotten():
     plant = Plant(unmodelled=structural)
     trials = [plant.trial(k, np.full(3, level)) for k, level in enumerate((3.0, 1.6, 1.6, 1.6, 1.6, 1.6))]
-    scales = [scale_quantile(condition(ToyLoop(), trials[:n]).checks, 1.0, 0.5) for n in (2, 6)]
+    scales = [scale_quantile(condition(ToyLoop(), trials[:n]).learnt.checks, 1.0, 0.5) for n in (2, 6)]
     assert scales[0] > 1.5
     assert scales[1] > 0.7 * scales[0]
 

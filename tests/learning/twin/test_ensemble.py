@@ -8,7 +8,7 @@ from toy_loop import NOISE, SPACE, Failing, Plant, Told, ToyLoop
 
 from chargetune.episode.score import Score
 from chargetune.learning.twin.calibration import SCALES, PredictionCheck
-from chargetune.learning.twin.ensemble import Ensemble, Prediction, condition
+from chargetune.learning.twin.ensemble import Ensemble, Learnt, Prediction, condition
 from chargetune.learning.twin.settings import TwinSettings
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -70,7 +70,7 @@ def test_a_plant_whose_loop_fails_keeps_nothing():
 
 def test_members_fail_where_the_loop_does_and_the_others_do_not():
     loop = Failing(ToyLoop(), lambda theta: theta[0] > 2.0)
-    ensemble = Ensemble(loop, TwinSettings(plants=4), None)
+    ensemble = Ensemble(loop, Learnt(loop.twin, TwinSettings(plants=4), None))
     assert ensemble.predict(SPACE.upper, 0).probability() == 0.0
     assert ensemble.central(SPACE.upper) is None
     assert ensemble.central(SPACE.default) is not None
@@ -85,7 +85,7 @@ def test_a_twin_is_none_where_the_newest_prediction_failed_or_no_scale_is_large_
     most = settings.standardised_error_max
 
     def says(*checks):
-        return Ensemble(ToyLoop(), settings, None, checks).rejected
+        return Learnt(ToyLoop().twin, settings, None, checks).rejected
 
     assert says() == says(flat(1.0), flat(0.99 * most)) == says(flat(2 * most), flat(1.0)) == ""
     # One prediction alone rests on a single trace.
@@ -99,7 +99,7 @@ def test_without_a_trace_the_plants_are_those_of_the_prior():
     trials = [Told(0, tuple(SPACE.default), "failed"), Told(1, tuple(SPACE.default), "running")]
     ensemble = condition(ToyLoop(), trials)
     assert ensemble.discrepancy is None
-    assert ensemble.checks == ()
+    assert ensemble.learnt.checks == ()
     shares = [ensemble.predict(np.full(3, level), 0).probability() for level in (0.5, 1.0, 1.5, 3.0)]
     assert shares == sorted(shares)
     assert shares[0] < 0.2
@@ -144,7 +144,7 @@ def test_what_was_learnt_before_changes_nothing_that_is_said(monkeypatch):
             fresh = condition(ToyLoop(), known, settings)
         np.testing.assert_array_equal(warm.discrepancy.posterior.mode, fresh.discrepancy.posterior.mode)
         np.testing.assert_array_equal(warm.discrepancy.posterior.root, fresh.discrepancy.posterior.root)
-        for one, other in zip(warm.checks, fresh.checks, strict=True):
+        for one, other in zip(warm.learnt.checks, fresh.learnt.checks, strict=True):
             np.testing.assert_array_equal(one.log_likelihood, other.log_likelihood)
         np.testing.assert_array_equal(*(one.predict(np.full(3, 1.5), 3).excess for one in (warm, fresh)))
 

@@ -67,20 +67,19 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The posterior of the twin's unknowns and the discrepancy that goes with each draw of them; None: no trace yet.
-
-    ``checks`` say how well each trace but the first was predicted by those before it.
-    """
+    """Plants of ``loop`` that its traces allow: draws of the posterior, and the discrepancy that goes with each of them."""
 
     loop: TwinLoop
-    settings: TwinSettings
-    discrepancy: Discrepancy | None
-    checks: tuple[PredictionCheck, ...] = ()
+    learnt: Learnt
 
-    @cached_property
-    def learnt(self) -> Learnt:
-        """What the traces say, without closed loops."""
-        return Learnt(self.loop.twin, self.settings, self.discrepancy, self.checks)
+    @property
+    def settings(self) -> TwinSettings:
+        return self.learnt.settings
+
+    @property
+    def discrepancy(self) -> Discrepancy | None:
+        """None: no trace yet."""
+        return self.learnt.discrepancy
 
     @property
     def rejected(self) -> str:
@@ -198,8 +197,7 @@ def episodes_of(trials: Sequence[TrialLike]) -> list[Episode]:
 
 def condition(loop: TwinLoop, trials: Sequence[TrialLike], settings: TwinSettings | None = None) -> Ensemble:
     """What the traces of these trials leave of the plants; the prior where there is none."""
-    found = learn(loop, trials, settings)
-    return Ensemble(loop, found.settings, found.discrepancy, found.checks)
+    return Ensemble(loop, learn(loop, trials, settings))
 
 
 def learn(loop: ModelledLoop, trials: Sequence[TrialLike], settings: TwinSettings | None = None) -> Learnt:
