@@ -44,6 +44,7 @@ def test_simulate_gives_the_reference_trajectories(file, name, cases):
     assert set(out["status"]) == {0}
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_every_reference_case_can_be_named_in_a_config(cases, tmp_path):
     for name, case in cases.items():
         text = "[controller]\n"
@@ -57,6 +58,7 @@ def test_every_reference_case_can_be_named_in_a_config(cases, tmp_path):
             np.testing.assert_allclose(out["current_A"], case["current"], atol=0.010)
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_simulate_takes_theta_by_name_and_by_position(tmp_path):
     path = write(tmp_path, QUICK)
     named = json.loads(chargetune("simulate", path, "--theta", '{"backoff_V": [0.1, 0.1, 0.1]}', "--json").stdout)
@@ -113,6 +115,7 @@ def test_a_bad_config_is_refused_before_anything_runs(change, words, tmp_path, r
     assert not (tmp_path / "s.sqlite").exists()
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_a_config_with_a_byte_order_mark_is_read(tmp_path):
     path = tmp_path / "bom.toml"
     path.write_bytes(b"\xef\xbb\xbf" + QUICK.encode())
@@ -125,6 +128,7 @@ def test_a_missing_file_and_a_missing_theta_are_refused(tmp_path):
     assert "theta is empty" in chargetune("tune", empty, code=2, cwd=tmp_path).stderr
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_tune_resumes_shows_and_draws(tmp_path):
     path = write(tmp_path, QUICK)
     first = json.loads(chargetune("tune", path, "--trials", 4, "--out", tmp_path / "out", "--json").stdout)
@@ -157,6 +161,7 @@ def test_another_seed_or_a_changed_config_does_not_resume_silently(tmp_path):
     assert "steps" in chargetune("tune", changed, "--trials", 2, "--store", store, code=2).stderr
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_workers_do_not_change_the_trials(tmp_path):
     text = QUICK.replace("trials = 6", "trials = 6\nbatch = 3")
     path = write(tmp_path, text)
@@ -215,6 +220,7 @@ def test_help_is_light():
         assert "--help" in chargetune(*command, "--help").stdout
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_a_store_survives_being_read_while_written(tmp_path):
     path, store = write(tmp_path, QUICK), tmp_path / "s.sqlite"
     chargetune("tune", path, "--store", store)

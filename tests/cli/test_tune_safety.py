@@ -23,11 +23,12 @@ STUDY = """
 [study]
 name = "safe"
 tuner = "{tuner}"
-trials = 3
+trials = 2
 [controller]
 mismatch_seed = 1
 [episode]
-steps = 240
+steps = 120
+soc_start = 0.4
 [sensors]
 voltage_noise_sd_V = 0.002
 [objective]
@@ -51,7 +52,7 @@ def test_a_safe_study_says_what_it_promised_and_spent(tmp_path):
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["violating"] == 0
-    assert found["tuned"]["trial"] == 2
+    assert found["tuned"]["trial"] == 1
     assert found["safety"] == {"probability": 0.95, "violation_mVs": 0.0, "budget_mVs": 100.0, "ended_at_a_limit": 0, "stopped": None}
 
 
