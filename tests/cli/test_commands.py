@@ -128,7 +128,6 @@ def test_a_missing_file_and_a_missing_theta_are_refused(tmp_path):
     assert "theta is empty" in chargetune("tune", empty, code=2, cwd=tmp_path).stderr
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_tune_resumes_shows_and_draws(tmp_path):
     path = write(tmp_path, QUICK)
     first = json.loads(chargetune("tune", path, "--trials", 4, "--out", tmp_path / "out", "--json").stdout)
@@ -161,7 +160,6 @@ def test_another_seed_or_a_changed_config_does_not_resume_silently(tmp_path):
     assert "steps" in chargetune("tune", changed, "--trials", 2, "--store", store, code=2).stderr
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_workers_do_not_change_the_trials(tmp_path):
     text = QUICK.replace("trials = 6", "trials = 6\nbatch = 3")
     path = write(tmp_path, text)
@@ -220,7 +218,6 @@ def test_help_is_light():
         assert "--help" in chargetune(*command, "--help").stdout
 
 
-@pytest.mark.usefixtures("virtual_machine")
 def test_a_store_survives_being_read_while_written(tmp_path):
     path, store = write(tmp_path, QUICK), tmp_path / "s.sqlite"
     chargetune("tune", path, "--store", store)
