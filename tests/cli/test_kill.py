@@ -40,7 +40,7 @@ def test_twenty_kills_change_nothing(tmp_path):
             time.sleep(rng.uniform(0.0, 0.1))
         else:
             # While it starts, so that some kills meet the first writes.
-            time.sleep(rng.uniform(0.0, 1.0))
+            time.sleep(rng.uniform(0.0, 0.4))
         if not process.is_alive():
             # It came to its end: go on with a fresh study.
             for file in tmp_path.glob("killed.sqlite*"):

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from commands import tuned
 
 from chargetune.cli import main
 from chargetune.study.store.salvage import salvage
@@ -36,13 +37,16 @@ def run(monkeypatch, capsys):
     return command
 
 
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    return tuned(tmp_path_factory.mktemp("studied"), QUICK)
+
+
 @pytest.fixture
-def store(tmp_path, run):
-    path = tmp_path / "s.toml"
-    path.write_text(QUICK)
-    code, *_ = run("tune", path, "--store", tmp_path / "s.db", "--json")
-    assert code == 0
-    return tmp_path / "s.db"
+def store(tmp_path, studied):
+    path = tmp_path / "s.db"
+    path.write_bytes(studied)
+    return path
 
 
 @pytest.fixture

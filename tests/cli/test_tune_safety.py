@@ -23,16 +23,18 @@ STUDY = """
 [study]
 name = "safe"
 tuner = "{tuner}"
-trials = 3
+trials = 2
 [controller]
 mismatch_seed = 1
 [episode]
-steps = 240
+steps = 120
+soc_start = 0.4
 [sensors]
 voltage_noise_sd_V = 0.002
 [objective]
 verdict_samples = 5
 [theta.R0]
+scale = true
 lower = 0.1
 upper = 4.0
 [safety]
@@ -51,19 +53,19 @@ def test_a_safe_study_says_what_it_promised_and_spent(tmp_path):
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["violating"] == 0
-    assert found["tuned"]["trial"] == 2
+    assert found["tuned"]["trial"] == 1
     assert found["safety"] == {"probability": 0.95, "violation_mVs": 0.0, "budget_mVs": 100.0, "ended_at_a_limit": 0, "stopped": None}
 
 
 def test_an_unsafe_start_is_found_before_the_first_charge(tmp_path):
-    done = tune(tmp_path, "start = { R0_ratio = 0.5 }")
+    done = tune(tmp_path, "start = { R0_scale = 0.5 }")
     assert done.returncode == 2
     assert "unsafe-start" in done.stderr
     assert not (tmp_path / "s.sqlite").exists()
 
 
 def test_a_trial_ended_at_the_limit_spends_the_budget_and_stops_the_study(tmp_path):
-    done = tune(tmp_path, "start = { R0_ratio = 0.5 }\nbudget_mVs = 1.0\nabort_margin_V = 0.03", "twin", "--force", "--json")
+    done = tune(tmp_path, "start = { R0_scale = 0.5 }\nbudget_mVs = 1.0\nabort_margin_V = 0.03", "twin", "--force", "--json")
     assert done.returncode == 2
     assert "the budget of violation is spent" in done.stderr
     found = json.loads(done.stdout)

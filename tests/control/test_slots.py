@@ -9,7 +9,7 @@ from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
 
 STEPS = 20
-COMPILED = pytest.mark.compiled_code
+COMPILED = pytest.mark.compiled_code(quick=True)
 
 
 def loop(slot, t, compiled):

@@ -73,7 +73,7 @@ def same(one, two, tolerance=1e-6):
         np.testing.assert_allclose(one.arrays()[name], two.arrays()[name], rtol=0, atol=tolerance, err_msg=name)
 
 
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code), False])
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code(quick=True)), False])
 def test_episode_is_that_of_step_by_step(heating, plant, compiled):
     whole = simulate(heating(), plant, steps=STEPS, given=TOLD, compiled=compiled)
     same(whole, run_episode(heating(), plant, steps=STEPS, given=TOLD))

@@ -68,7 +68,7 @@ TOLD = {"bounds that move": {"most": np.where(np.arange(STEPS) < 6, -0.1, 0.9)}}
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code), False])
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code(quick=True)), False])
 def test_whole_episode_is_that_of_step_by_step_and_of_ipopt(case, compiled):
     controller, given = own(**CASES[case]), TOLD.get(case)
     whole = simulate(controller, PLANT, steps=STEPS, given=given, compiled=compiled)

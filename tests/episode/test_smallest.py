@@ -46,7 +46,7 @@ def filling(**changes):
     return Controller.build(tank(1.0), space, **(settings | changes))
 
 
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code), False])
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.compiled_code(quick=True)), False])
 def test_one_output_without_delay(same, compiled):
     controller, plant = filling(), SimulatedPlant(tank(1.2), {})
     whole = simulate(controller, plant, steps=60, theta=[1.0], compiled=compiled)

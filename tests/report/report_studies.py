@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
-from scipy.stats import qmc
 
 from chargetune.battery.charging.evaluate import Evaluation
 from chargetune.battery.charging.limits import LimitSettings
@@ -31,6 +30,9 @@ class LocalSobol:
     seed: int = 2
 
     def ask(self, space, trials, n=1):
+        # Who reads a store alone needs none of it, and it takes a second.
+        from scipy.stats import qmc
+
         points = qmc.Sobol(space.dimension, rng=self.seed).random(128)
         start = space.to_unit(space.default)
         thetas = space.from_unit(start + self.reach * (points - start))

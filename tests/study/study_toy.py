@@ -1,7 +1,12 @@
-"""A deterministic study in two parameters: a tuner that learns, an evaluation that violates, fails and leaves a trace."""
+"""A deterministic study in two parameters: a tuner that learns, an evaluation that violates, fails and leaves a trace.
+
+What tests call in worker processes stands here too, and the study is imported only where it is opened: each process of a pool begins
+with the import of this module.
+"""
 
 import multiprocessing
 import os
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +15,8 @@ import numpy as np
 
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import Parameter, ParameterSpace
+from chargetune.plants.plant import SetUpError
 from chargetune.study.evaluation import trial_seed
-from chargetune.study.study import Study
 
 SPACE = ParameterSpace((Parameter("x", 0.0, 1.0, 0.5), Parameter("r", 0.1, 6.0, 1.0, scale="log")))
 SEED = 11
@@ -114,7 +119,35 @@ def not_here():
     raise RuntimeError("not here")
 
 
+def misspelt(theta, seed):
+    return undefined_name(theta, seed)  # noqa: F821 - the error of a program that is tested
+
+
+def refused(theta, seed):
+    raise SetUpError("plant: parameters = 'none', allowed is one that there is")
+
+
+def environment(_):
+    time.sleep(0.2)
+    return os.environ["OMP_NUM_THREADS"], signal.getsignal(signal.SIGINT), os.getpid()
+
+
+def pid_after(pause_s):
+    time.sleep(pause_s)
+    return os.getpid()
+
+
+def begin_and_wait(folder, number):
+    (folder / str(number)).write_text(str(os.getpid()))
+    try:
+        time.sleep(600)
+    finally:
+        (folder / f"{number} left").touch()
+
+
 def open_study(store, name="toy", **changes):
+    from chargetune.study.study import Study
+
     arguments = {"config": CONFIG, "space": SPACE, "tuner": Halfway(3), "seed": SEED} | changes
     return Study.create_or_resume(store, name, **arguments)
 

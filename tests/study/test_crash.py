@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import Engine, event
-from study_toy import Toy, essence, open_study, told_by_another_process
+from study_toy import Toy, essence, open_study, pid_after, told_by_another_process
 
 from chargetune.study.executors import process_executor
 from chargetune.study.store.integrity import check_store
@@ -186,11 +186,6 @@ def both_at_work(pool):
     while len(pids) < 2:
         pids |= set(pool.map(pid_after, [0.1, 0.1]))
     return pids
-
-
-def pid_after(pause_s):
-    time.sleep(pause_s)
-    return os.getpid()
 
 
 def alive(pid):

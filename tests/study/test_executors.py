@@ -5,17 +5,12 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import pytest
-from study_toy import Deadly, OnlyHere, Toy, essence, open_study
+from study_toy import Deadly, OnlyHere, Toy, begin_and_wait, environment, essence, open_study
 
 from chargetune.study import executors
 from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.store.store import Store
 from chargetune.study.study import StudyError, WorkerError
-
-
-def environment(_):
-    time.sleep(0.2)
-    return os.environ["OMP_NUM_THREADS"], signal.getsignal(signal.SIGINT), os.getpid()
 
 
 def test_processes_give_the_trials_of_this_process(store, tmp_path):
@@ -134,14 +129,6 @@ def test_workers_have_one_thread_ignore_ctrl_c_and_this_process_keeps_its_own_se
 def test_bad_workers(workers):
     with pytest.raises(ValueError, match=f"workers = {workers}, allowed is an integer >= 1"):
         process_executor(workers)
-
-
-def begin_and_wait(folder, number):
-    (folder / str(number)).write_text(str(os.getpid()))
-    try:
-        time.sleep(600)
-    finally:
-        (folder / f"{number} left").touch()
 
 
 def test_an_interrupt_waits_for_no_evaluation_and_cancels_what_is_queued(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from study_toy import CONFIG, SEED, SPACE, Halfway, Toy, ToyEpisode, essence, open_study
+from study_toy import CONFIG, SEED, SPACE, Halfway, Toy, ToyEpisode, essence, misspelt, open_study, refused
 
 from chargetune.episode.score import Score
 from chargetune.model.parameter_space import Parameter, ParameterSpace
@@ -416,14 +416,6 @@ def test_config_of_the_toy_is_stored(store):
         assert trial.provenance["study_sha256"] == study.record.identity_sha256
         assert trial.provenance["versions"]["numpy"] == np.__version__
         assert Parameter(**{**study.record.identity["space"][1], "default": (1.0,)}) == SPACE.parameters[1]
-
-
-def misspelt(theta, seed):
-    return undefined_name(theta, seed)  # noqa: F821 - the error of a program that is tested here
-
-
-def refused(theta, seed):
-    raise SetUpError("plant: parameters = 'none', allowed is one that there is")
 
 
 @pytest.mark.parametrize("workers", [None, 2])

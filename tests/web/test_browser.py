@@ -19,6 +19,14 @@ def address(store, serve):
         yield where
 
 
+@pytest.fixture(scope="module")
+def report(store, tmp_path_factory):
+    """The report of the first study as a file."""
+    file = tmp_path_factory.mktemp("report") / "report.html"
+    file.write_text(report_page(read_study(store, "charge")), encoding="utf-8")
+    return file
+
+
 def column(page, index):
     return page.locator(f"#rows tr td:nth-child({index})").all_inner_texts()
 
@@ -126,10 +134,8 @@ def test_nothing_is_wider_than_a_phone(open_page, address, path, scheme):
 
 
 @pytest.mark.parametrize("width", [390, 1400])
-def test_report_opens_from_a_file_without_a_network(open_page, store, tmp_path, width):
-    file = tmp_path / "report.html"
-    file.write_text(report_page(read_study(store, "charge")), encoding="utf-8")
-    page = open_page(file.as_uri(), width=width)
+def test_report_opens_from_a_file_without_a_network(open_page, report, width):
+    page = open_page(report.as_uri(), width=width)
     page.context.set_offline(True)
     page.wait_for_selector(DRAWN, state="attached")
     captions = page.locator("figcaption").all_inner_texts()
@@ -142,11 +148,8 @@ def test_report_opens_from_a_file_without_a_network(open_page, store, tmp_path, 
 
 
 @pytest.mark.parametrize("kind", ["report", "live"])
-def test_no_button_sends_a_figure_anywhere(open_page, address, store, tmp_path, kind):
-    file = tmp_path / "report.html"
-    if kind == "report":
-        file.write_text(report_page(read_study(store, "charge"), evaluate=False), encoding="utf-8")
-    page = open_page(file.as_uri() if kind == "report" else f"{address}/studies/1", wait=DRAWN)
+def test_no_button_sends_a_figure_anywhere(open_page, address, report, kind):
+    page = open_page(report.as_uri() if kind == "report" else f"{address}/studies/1", wait=DRAWN)
     shown = page.evaluate(SHOWN)
     assert len(shown) > 4
     assert all(buttons == BUTTONS for buttons in shown), shown

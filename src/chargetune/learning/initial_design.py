@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
@@ -29,6 +28,8 @@ class Sobol:
 
 def sobol_points(dimension: int, seed: int, first: int, n: int) -> NDArray[np.float64]:
     """Points ``first`` .. ``first + n - 1`` of the scrambled Sobol sequence in the unit cube, shape (n, d)."""
+    from scipy.stats import qmc
+
     sequence = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed))
     # A Sobol sequence is balanced for powers of two only: it is drawn up to the next one, and cut.
     points: NDArray[np.float64] = sequence.random_base2((first + n - 1).bit_length())

@@ -8,8 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import qmc
 
 from chargetune.plants.simulated import SimulatedPlant
 from chargetune.plants.variation import Variation
@@ -79,6 +77,8 @@ class RangeOfUse:
             raise ValueError(f"range: count = {count!r}, allowed is an integer >= 1")
         shares = self._shares(first + count, seed)[first:]
         if scores is not None:
+            from scipy.special import ndtr
+
             given = np.atleast_2d(np.asarray(scores, dtype=float))
             own = int(self.of_plant.sum())
             if given.shape not in ((count, own), (1, own)):
@@ -91,6 +91,8 @@ class RangeOfUse:
 
     def plant_scores(self, seed: int) -> NDArray[np.float64]:
         """Normal scores of one plant, the first draw of this seed, as `draw` takes them, shape (numbers of the plant,)."""
+        from scipy.special import ndtri
+
         return np.asarray(ndtri(self._shares(1, seed)[0, self.of_plant]))
 
     @property
@@ -99,6 +101,8 @@ class RangeOfUse:
 
         By bisection of each quantile function.
         """
+        from scipy.special import ndtri
+
         parts = [one.distribution for one, size in zip(self.variations, self.sizes, strict=True) if one.of == "plant" for _ in range(size)]
         low, high = np.full(len(parts), LEAST_SHARE), np.full(len(parts), 1.0 - LEAST_SHARE)
         for _ in range(BISECTIONS):
@@ -112,6 +116,8 @@ class RangeOfUse:
         numbers = sum(self.sizes)
         if not numbers:
             return np.zeros((count, 0))
+        from scipy.stats import qmc
+
         # A Sobol sequence is balanced at powers of two; a longer one begins with the shorter.
         points = qmc.Sobol(numbers, scramble=True, rng=np.random.default_rng([seed, 1])).random_base2(int(np.ceil(np.log2(max(count, 2)))))
         return np.asarray(np.clip(points[:count], LEAST_SHARE, 1.0 - LEAST_SHARE))

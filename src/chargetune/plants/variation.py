@@ -9,7 +9,6 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 __all__ = ["Choice", "Distribution", "LogNormal", "Normal", "Uniform", "Variation"]
 
@@ -51,6 +50,8 @@ class Normal:
             raise ValueError(f"normal: sd = {self.sd!r}, allowed is >= 0")
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        from scipy.special import ndtri
+
         return np.asarray(self.mean + self.sd * ndtri(share))
 
 
@@ -67,6 +68,8 @@ class LogNormal:
             raise ValueError(f"log-normal: median = {self.median!r}, log_sd = {self.log_sd!r}, allowed are a median > 0 and a log_sd >= 0")
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        from scipy.special import ndtri
+
         return np.asarray(self.median * np.exp(self.log_sd * ndtri(share)))
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from chargetune.battery.charging.problem import with_feedback
 from chargetune.battery.studies.open_study import evaluation_of
@@ -143,6 +142,8 @@ def rank_correlations(view: StudyView) -> dict[str, tuple[float, float]]:
     scored = [t for t in view.trials if t.score is not None]
     if len(scored) < LEAST_TRIALS:
         return {}
+    from scipy.stats import spearmanr
+
     thetas = np.array([t.theta for t in scored])
     objective = np.array([t.score.objective for t in scored if t.score is not None])
     excess = np.array([worst_excess(view, t.score) for t in scored])

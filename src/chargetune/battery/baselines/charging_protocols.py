@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.optimize import brentq
 
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.plants.steppable import SteppablePlant
@@ -117,6 +116,8 @@ def _largest(excess: Callable[[float], float], most: float, current_max_A: float
         return max(most, 0.0)
     if excess(0.0) >= 0:
         return 0.0
+    from scipy.optimize import brentq
+
     tolerance = CURRENT_TOLERANCE * current_max_A
     # The root may lie a tolerance beyond the limit.
     return max(0.0, float(brentq(excess, 0.0, most, xtol=tolerance, rtol=1e-8)) - tolerance)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
@@ -146,6 +145,8 @@ class _Factor:
     log_sd: float
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        from scipy.special import ndtri
+
         return np.asarray(np.expm1(self.log_sd * ndtri(share)), dtype=np.float64)
 
 

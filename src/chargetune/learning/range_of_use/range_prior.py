@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from chargetune.episode.episode import Episode
 from chargetune.learning.twin.twin import Twin, Uncertain
@@ -129,6 +128,8 @@ class RangePrior:
 
     def _values(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Numbers v of scores e, the same shape."""
+        from scipy.special import ndtr
+
         shares = np.clip(ndtr(scores), LEAST_SHARE, 1.0 - LEAST_SHARE)
         parts = np.split(shares, np.cumsum([size for _, size in self._plants])[:-1], axis=-1)
         return np.concatenate([one.distribution.at(part) for (one, _), part in zip(self._plants, parts, strict=True)], axis=-1)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from chargetune.battery.cell.cell import Cell
 from chargetune.battery.cell.equivalent_circuit import FLOOR, table_nodes
@@ -43,11 +42,15 @@ START = "start"
 
 def backoff_values(backoff: Backoff, nodes_V: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
     """b(z) in the unit of its node values: a natural cubic spline."""
+    from scipy.interpolate import CubicSpline
+
     return np.asarray(CubicSpline(backoff.grid, np.asarray(nodes_V, dtype=float), bc_type="natural")(soc))
 
 
 def resistance_values(own: tuple[float, ...], nodes_ohm: ArrayLike, soc: ArrayLike = SOC) -> NDArray[np.float64]:
     """R(z) in ohm of a circuit with these values at the SOC nodes ``own``: natural cubic spline, constant beyond, kept positive."""
+    from scipy.interpolate import CubicSpline
+
     values = np.asarray(nodes_ohm, dtype=float)
     nodes = table_nodes(own)
     spline = CubicSpline(nodes, np.interp(nodes, own, values), bc_type="natural")(soc)
@@ -81,6 +84,8 @@ def backoff_figure(view: StudyView) -> Figure:
     cell, part = problem.cell, view.space.slices["backoff_V"]
     grid = problem.theta.backoff.grid
     with journal_style():
+        from scipy.interpolate import PchipInterpolator
+
         figure, (axis,) = new_figure(COLUMN_IN, 2.7)
         nodes = {label: 1e3 * np.array(theta[part]) for label, theta in _thetas(view).items()}
         drawn = {label: backoff_values(problem.theta.backoff, values) for label, values in nodes.items()}

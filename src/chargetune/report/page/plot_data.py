@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from chargetune.battery.charging.problem import ChargingProblem
 from chargetune.episode.episode import Episode
@@ -68,6 +67,8 @@ def profiles(view: StudyView, theta: NDArray[np.float64]) -> list[dict[str, Any]
     problem, out = view.problem, []
     if problem is None:
         return []
+    from scipy.interpolate import CubicSpline
+
     curves = problem.theta.curves
     slices, soc = view.space.slices, 100 * SOC[::2]
     if curves.backoff is not None:
