@@ -12,8 +12,25 @@ PAGES = {
     "CHANGELOG.md": "changes.md",
     "benchmarks/README.md": "benchmarks.md",
 }
+# The scripts of examples/gallery as a reader would take them: a cell, learning, a range of use, other systems, one's own parts, machines.
+GALLERY = (
+    *("pulses_to_cell", "case_study", "feedback_or_learning", "safe_charges", "unmeasured_limit"),
+    *("range_of_use", "theta_over_temperature", "certificate"),
+    *("crane", "stirred_tank", "building", "gymnasium_plant", "own_estimator"),
+    *("dask_workers", "postgresql_live"),
+)
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 KINDS = {"added": "Added", "changed": "Changed", "fixed": "Fixed", "removed": "Removed"}
+
+
+class GalleryOrder:
+    """Sphinx-gallery's key for the order of scripts: their place in `GALLERY`. ValueError for one that is not there."""
+
+    def __init__(self, _src_dir):
+        pass
+
+    def __call__(self, file):
+        return GALLERY.index(Path(file).stem)
 
 
 def read_page(app, docname, source):
@@ -55,6 +72,10 @@ def led(text, origin, page):
             return match[0]
         file = _plain(PurePosixPath(origin).parent / path)
         there = f"docs/{PAGES[file]}" if file in PAGES else file
+        if file.startswith("examples/gallery/") and (ROOT / file).exists():
+            # Its page is made from it when the site is built.
+            there = f"docs/gallery/{PurePosixPath(file).stem.replace('README', 'index')}.rst"
+            return f"[{label}]({_relative(there, PurePosixPath(page).parent)})"
         way = _relative(there, PurePosixPath(page).parent)
         if image or not (ROOT / there).exists() or (there.endswith(".md") and there.startswith("docs/")):
             return f"{image}[{label}]({way}{mark}{anchor})"
