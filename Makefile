@@ -4,6 +4,8 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 # Two at a time: mypy uses one core and runs beside the tests.
 MAKEFLAGS += --jobs=2
+# Where it is set every process compiles every package anew: 1.3 s each for most of what starts here.
+unexport PYTHONDONTWRITEBYTECODE
 
 PYTHON ?= python3
 # Package index of PyTorch's CPU builds, for machines where pip would otherwise choose a CUDA build (README, Set-up).
@@ -14,7 +16,7 @@ READY := .venv/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 LOCK_VENV := build/lock-venv
 
-.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock reference docs gallery clean
+.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock packages packages-core bounds reference docs gallery clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
@@ -74,6 +76,17 @@ lock: ## renew requirements.lock from the ranges in pyproject.toml
 	  $(LOCK_VENV)/bin/pip freeze --all --exclude-editable --exclude pip \
 	  | sed 's/+cpu$$//' | grep -Ev '^(cuda|nvidia|triton)'; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
+
+packages: $(READY) ## build sdist and wheel, and try the wheel where nothing else is: no compiler, each extra alone
+	$(BIN)/python .ci/packages.py
+
+packages-core: $(READY) ## the same without the extras and the type checker
+	$(BIN)/python .ci/packages.py --core
+
+# With PYTHON=python3.12 it is a test with that Python. Several minutes and a gigabyte of packages.
+bounds: ## test with the lowest and with the newest versions of the dependencies, in environments of their own
+	TORCH_INDEX=$(TORCH_INDEX) $(PYTHON) .ci/bounds.py lowest
+	TORCH_INDEX=$(TORCH_INDEX) $(PYTHON) .ci/bounds.py newest
 
 # -W: a warning, such as a link that leads nowhere, is an error.
 docs: $(READY) ## build the site into build/site, without running the scripts of the gallery

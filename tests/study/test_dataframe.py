@@ -122,10 +122,10 @@ def test_the_data_frame_holds_the_trials_and_invents_nothing(store):
 def test_without_its_packages_the_message_names_the_extra(store, monkeypatch):
     for package in ("pandas", "tqdm.auto"):
         monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=r"needs pandas: pip install chargetune\[notebook\]"):
+    with pytest.raises(ImportError, match=r"needs pandas: pip install 'chargetune\[notebook\]'"):
         trials_dataframe(SPACE, [])
     with open_study(store) as study:
-        with pytest.raises(ImportError, match=r"progress=True needs tqdm: pip install chargetune\[notebook\]"):
+        with pytest.raises(ImportError, match=r"progress=True needs tqdm: pip install 'chargetune\[notebook\]'"):
             study.run(Toy(), 2, progress=True)
         assert study.trials() == []
 

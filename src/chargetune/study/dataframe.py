@@ -23,7 +23,7 @@ def trials_dataframe(space: ParameterSpace, trials: Sequence[Trial]) -> Any:
     try:
         import pandas as pd
     except ImportError as error:
-        raise ImportError("trials_dataframe needs pandas: pip install chargetune[notebook]") from error
+        raise ImportError("trials_dataframe needs pandas: pip install 'chargetune[notebook]'") from error
     rows = [_row(space, trial) for trial in trials]
     # In this order also where the first trials failed and have no score.
     columns = list(dict.fromkeys(name for row in rows for name in row))

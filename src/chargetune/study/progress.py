@@ -38,7 +38,7 @@ def progress_bar(known: Iterable[Trial], trials: int) -> Iterator[Progress]:
     try:
         from tqdm.auto import tqdm
     except ImportError as error:
-        raise ImportError("progress=True needs tqdm: pip install chargetune[notebook]") from error
+        raise ImportError("progress=True needs tqdm: pip install 'chargetune[notebook]'") from error
     told = sum(t.status is not TrialStatus.RUNNING for t in known)
     with tqdm(total=max(trials, told), initial=told, unit="trial") as bar:
 

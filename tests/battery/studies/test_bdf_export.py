@@ -48,7 +48,7 @@ def store(request, tmp_path_factory):
 
 
 def read(path):
-    return pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path)
+    return pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, float_precision="round_trip")
 
 
 @pytest.mark.parametrize("form", ["parquet", "csv"])

@@ -88,7 +88,7 @@ def _parquet(path: Path) -> Table:
     try:
         from pyarrow import ArrowException, parquet
     except ImportError as error:
-        raise ValueError(f"to read {path.name} chargetune needs pyarrow: pip install chargetune[export]") from error
+        raise ValueError(f"to read {path.name} chargetune needs pyarrow: pip install 'chargetune[export]'") from error
     try:
         whole = parquet.read_table(path)
     except (ArrowException, OSError) as error:
@@ -101,7 +101,7 @@ def _sheets(path: Path) -> list[Table]:
     try:
         import python_calamine as calamine
     except ImportError as error:
-        raise ValueError(f"to read {path.name} chargetune needs python-calamine: pip install chargetune[excel]") from error
+        raise ValueError(f"to read {path.name} chargetune needs python-calamine: pip install 'chargetune[excel]'") from error
     try:
         book = calamine.CalamineWorkbook.from_path(str(path))
         sheets = [(name, book.get_sheet_by_name(name).to_python(skip_empty_area=False)) for name in book.sheet_names]

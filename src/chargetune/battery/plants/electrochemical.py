@@ -260,7 +260,7 @@ def _built(settings: Electrochemical, soc_start: float) -> _Built:
         import pybamm
     except ImportError as error:
         raise SetUpError(
-            f"an electrochemical plant needs PyBaMM, which cannot be imported ({error}): pip install chargetune[pybamm]"
+            f"an electrochemical plant needs PyBaMM, which cannot be imported ({error}): pip install 'chargetune[pybamm]'"
         ) from error
 
     # Warnings that inputs are missing where only the initial state is computed.
