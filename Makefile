@@ -19,7 +19,7 @@ LOCK_VENV := build/lock-venv
 .PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock packages packages-core bounds reference docs gallery clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
 
 # --no-compile: what is imported is compiled then, and most modules of the packages never are.
 setup: $(READY) ## make .venv with the locked versions
