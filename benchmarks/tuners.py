@@ -1,4 +1,4 @@
-"""Which tuner of an MPC needs how many trials, and what it breaks on the way: plants of the literature, each known wrongly to its controller.
+"""Which tuner of an MPC needs how many trials, and what it breaks on the way, on plants that the controller believes to be others.
 
     python benchmarks/tuners.py [--plants a,b] [--methods a,b] [--seeds 0:10] [--trials 10] [--workers 2] [--json | --page]
 
@@ -45,21 +45,26 @@ PLANTS = {
 made = lru_cache(maxsize=1)(lambda name, seed: PLANTS[name](seed))
 
 
-def one(trials: int, cache: Path, job: tuple[int, str, str]) -> dict:
+def one(args: argparse.Namespace, job: tuple[int, str, str]) -> dict:
     """The line of one run."""
     seed, name, method = job
+    trials, cache = trials_of(args, method), args.cache
     # What these fit is small: a second thread mostly waits.
     torch.set_num_threads(1)
-    # From a cold cache the first episode of a controller takes a compiler half a minute.
     plant = made(name, seed)
     return {"plant": name, "method": method, "seed": seed, "trials": trials, **run(plant, METHODS[method], seed, trials, cache)}
 
 
 def missing(args: argparse.Namespace, known: Sequence[dict]) -> list[tuple[int, str, str]]:
     """What is asked and not yet run: (seed, plant, method)."""
-    there = {(r["seed"], r["plant"], r["method"]) for r in known if r["trials"] >= args.trials}
+    there = {(r["seed"], r["plant"], r["method"]) for r in known if r["trials"] >= trials_of(args, r["method"])}
     jobs = [job for job in product(args.seeds, args.plants, args.methods) if job not in there]
     return [(seed, name, method) for seed, name, method in jobs if applies(name, method)]
+
+
+def trials_of(args: argparse.Namespace, method: str) -> int:
+    """How many trials a run of this method has."""
+    return args.twin_trials or args.trials if METHODS[method].needs == "twin" else args.trials
 
 
 def applies(name: str, method: str) -> bool:
@@ -85,13 +90,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print("smac is left out: pip install smac", file=sys.stderr)
     jobs = missing(args, read(args.out))
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    work = partial(one, args.trials, args.cache)
+    work = partial(one, args)
     begin = time.monotonic()
     with ProcessPoolExecutor(args.workers) as pool:
         for line in map(work, jobs) if args.workers == 1 else pool.map(work, jobs):
             with args.out.open("a") as file:
                 file.write(json.dumps(line) + "\n")
-            print(f"{time.monotonic() - begin:6.0f} s  seed {line['seed']}  {line['plant']:16s} {line['method']}", file=sys.stderr, flush=True)
+            passed = f"{time.monotonic() - begin:6.0f} s"
+            print(f"{passed}  seed {line['seed']}  {line['plant']:16s} {line['method']}", file=sys.stderr, flush=True)
     mine = [r for r in read(args.out) if r["seed"] in args.seeds and r["plant"] in args.plants and r["method"] in args.methods]
     found = rows(mine)
     if args.json:
@@ -106,6 +112,7 @@ def asked(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--seeds", default="0:10", help="A:B, B not included")
     parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--twin-trials", type=int, help="of the twins, whose proposals take seconds; default: --trials")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("out/tuners/runs.jsonl"))
     parser.add_argument("--cache", type=Path, default=Path("out/tuners/oracle"), help="folder of the best theta of each plant")

@@ -67,6 +67,7 @@ METHODS: dict[str, Method] = twins() | {
     "smac": Method(lambda p, seed: Smac(p.space, seed), "SMAC3 2.4, random forest, on the scalar performance"),
     "tpe": Method(lambda p, seed: Tpe(p.space, seed), "Optuna's TPE on the scalar performance"),
     "cmaes": Method(lambda p, seed: CmaEs(p.space, seed), "CMA-ES on the scalar performance"),
-    "safeopt": Method(lambda p, seed: SafeGaussianProcess(p.safe_theta, seed), "a safe set of Gaussian processes after SafeOpt, from the declared start"),
+    "safeopt": Method(lambda p, seed: SafeGaussianProcess(p.safe_theta, seed),
+        "safe set of Gaussian processes after SafeOpt, from the declared start"),
     "random": Method(lambda _, seed: Uniform(seed), "uniform draws"),
 }  # fmt: skip

@@ -28,8 +28,8 @@ PENALTY = 10.0
 def attainable(plant: SuitePlant, seed: int, cache: Path) -> dict[str, Any]:
     """{"objective", "theta", "default", "safe"} of this plant, from the cache where it is known.
 
-    Best of Sobol points, of the declared start, and of CMA-ES (Hansen, 2016) from the best of them, twice, on the loop without noise. "default"
-    and "safe" are the objectives of theta_0 and of the declared start, None where these break a limit.
+    Best of Sobol points, of the declared start, and of CMA-ES (Hansen, 2016) from the best of them, twice, on the loop without noise.
+    "default" and "safe" are the objectives of theta_0 and of the declared start, None where these break a limit.
     """
     file = cache / f"{plant.name} {seed}.json"
     if file.exists():
@@ -51,8 +51,8 @@ def attainable(plant: SuitePlant, seed: int, cache: Path) -> dict[str, Any]:
     starts = [space.to_unit(np.array(plant.safe_theta)), space.to_unit(space.default), *sobol_points(space.dimension, 0, 0, POINTS)]
     at = min(starts, key=loss)
     for step, generations in STEPS:
-        options = {"bounds": [0.0, 1.0], "seed": seed + 1, "verbose": -9, "maxiter": generations, "tolfun": 1e-5 * scale, "tolflatfitness": 8}
-        es = cma.CMAEvolutionStrategy(list(at), step, options)
+        ends = {"maxiter": generations, "tolfun": 1e-5 * scale, "tolflatfitness": 8}
+        es = cma.CMAEvolutionStrategy(list(at), step, ends | {"bounds": [0.0, 1.0], "seed": seed + 1, "verbose": -9})
         es.optimize(loss)
         found = space.to_unit(np.array(best[0][1]))
         at = found if np.isfinite(best[0][0]) else np.clip(es.result.xbest, 0.0, 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -72,11 +72,12 @@ def simulated_plant(
     def score(episode: ct.Episode) -> ct.Evaluation:
         return ct.score_limits(episode, limits, objective=objective)
 
-    def loop(sensors: ct.Sensors) -> Any:
+    @cache
+    def loop(*, noisy: bool) -> Any:
+        sensors = ct.Sensors(noise_sd=dict(noise_sd) if noisy else {})
         plant = ct.SimulatedPlant(truth, dict(start), sensors, given=tuple(plant_given), input_before=before)
         return compiled_episode(controller, plant, steps)
 
-    noisy, exact = loop(ct.Sensors(noise_sd=dict(noise_sd))), loop(ct.Sensors())
     twin = None
     if unknowns:
         twin = ct.SimulatedTwin.build(
@@ -87,8 +88,8 @@ def simulated_plant(
         name=name,
         source=source,
         space=controller.theta,
-        evaluate=lambda theta, seed: score(noisy.run(theta, seed, given=told or None)),
-        judge=lambda theta: score(exact.run(theta, given=told or None)).score,
+        evaluate=lambda theta, seed: score(loop(noisy=True).run(theta, seed, given=told or None)),
+        judge=lambda theta: score(loop(noisy=False).run(theta, given=told or None)).score,
         safe_theta=tuple(float(v) for v in safe_theta),
         twin=twin,
     )

@@ -22,11 +22,11 @@ __all__ = ["run"]
 def run(plant: SuitePlant, method: Method, seed: int, trials: int, cache: Path) -> dict[str, Any]:
     """What `tuner_suite.table` counts, an entry a trial: judged without noise, at the tolerances that the tuner is told.
 
-    kept, ratio: whether the trial kept every limit, and (best - objective) / |best| of it; solved: whether the recommended one keeps them
-    and is within 5 % of the best; ask_s: seconds for the proposal; stopped: why a tuner proposed no more.
+    kept, loss: whether the trial kept every limit, and (best - objective) / |best| of it, None where it has no score; solved: whether the
+    recommended trial kept them and is within 5 % of the best; ask_s: seconds for the proposal; stopped: why a tuner proposed no more.
     """
     best = attainable(plant, seed, cache)["objective"]
-    tuner, told = method.make(plant, seed), []
+    tuner, told, worth = method.make(plant, seed), [], []
     out: dict[str, Any] = {"kept": [], "loss": [], "solved": [], "ask_s": [], "stopped": ""}
     for number in range(trials):
         begin = time.perf_counter()
@@ -45,12 +45,12 @@ def run(plant: SuitePlant, method: Method, seed: int, trials: int, cache: Path) 
         )
         true = plant.judge(theta)
         out["kept"].append(bool(true is not None and true.feasible))
+        worth.append(-np.inf if true is None else true.objective)
         out["loss"].append(None if true is None else round((best - true.objective) / abs(best), 4))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             at = _recommended(method, tuner, plant, told)
-        loss = out["loss"][at]
-        out["solved"].append(out["kept"][at] and loss is not None and within(-loss, 0.0 * loss))
+        out["solved"].append(out["kept"][at] and within(worth[at], best))
     return out
 
 
