@@ -22,12 +22,12 @@ __all__ = ["run"]
 def run(plant: SuitePlant, method: Method, seed: int, trials: int, cache: Path) -> dict[str, Any]:
     """What `tuner_suite.table` counts, an entry a trial: judged without noise, at the tolerances that the tuner is told.
 
-    kept, loss: whether the trial kept every limit, and (best - objective) / |best| of it, None where it has no score; solved: whether the
-    recommended trial kept them and is within 5 % of the best; ask_s: seconds for the proposal; stopped: why a tuner proposed no more.
+    kept, loss: whether the trial kept every limit, and (best - objective) / |best| of it, None where it has no score;
+    recommended, solved: the index of the trial that is recommended, and whether it kept them and is within 5 % of the best; ask_s: seconds for the proposal; stopped: why a tuner proposed no more.
     """
     best = attainable(plant, seed, cache)["objective"]
     tuner, told, worth = method.make(plant, seed), [], []
-    out: dict[str, Any] = {"kept": [], "loss": [], "solved": [], "ask_s": [], "stopped": ""}
+    out: dict[str, Any] = {"kept": [], "loss": [], "recommended": [], "solved": [], "ask_s": [], "stopped": ""}
     for number in range(trials):
         begin = time.perf_counter()
         with warnings.catch_warnings():
@@ -50,6 +50,7 @@ def run(plant: SuitePlant, method: Method, seed: int, trials: int, cache: Path) 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             at = _recommended(method, tuner, plant, told)
+        out["recommended"].append(at)
         out["solved"].append(out["kept"][at] and within(worth[at], best))
     return out
 
