@@ -22,8 +22,9 @@ __all__ = ["run"]
 def run(plant: SuitePlant, method: Method, seed: int, trials: int, cache: Path) -> dict[str, Any]:
     """What `tuner_suite.table` counts, an entry a trial: judged without noise, at the tolerances that the tuner is told.
 
-    kept, loss: whether the trial kept every limit, and (best - objective) / |best| of it, None where it has no score;
-    recommended, solved: the index of the trial that is recommended, and whether it kept them and is within 5 % of the best; ask_s: seconds for the proposal; stopped: why a tuner proposed no more.
+    kept, loss: whether the trial kept every limit, and (best - objective) / |best| of it, None where it has no score; recommended, solved:
+    the index of the trial that is recommended, and whether it kept them and is within 5 % of the best; ask_s: seconds for the proposal;
+    stopped: why a tuner proposed no more.
     """
     best = attainable(plant, seed, cache)["objective"]
     tuner, told, worth = method.make(plant, seed), [], []
