@@ -185,7 +185,6 @@ def tclab(seed: int) -> SuitePlant:
         safe_theta=(1.0, 1.0, 5.0, 1e-3),
         unknowns=[ct.Uncertain(k, sd=s / 2) for k, s in spread.items()],
         given=given,
-        discrepancy_sd_floor={"t1": 0.5, "t2": 0.5},
     )
 
 
