@@ -21,7 +21,7 @@ def tuners(monkeypatch):
     from tuner_suite import oracle
 
     # Two dimensions and a coarse optimum: this many generations find it.
-    monkeypatch.setattr(oracle, "STEPS", ((0.2, 12),))
+    monkeypatch.setattr(oracle, "STEPS", ((0.2, 6),))
     monkeypatch.setattr(script, "PLANTS", dict(script.PLANTS))
     yield script
     script.METHODS.pop("nearby", None)
