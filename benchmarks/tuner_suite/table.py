@@ -16,9 +16,9 @@ WANTED = 6
 def rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of every plant and method that was run.
 
-    seeds; solved: of them within `WANTED` trials; trials: the median number of trials to the first solution, None where half of the seeds or
-    more have none; over, over_max, over_sum: of the first `WANTED` trials those that broke a limit, median, largest and all; of:
-    trials of a run; ask_s: median seconds of a proposal; stopped: seeds on which the tuner refused to go on.
+    seeds; solved: of them within `WANTED` trials; trials: the median number of trials to the first solution, None where half of them or
+    more have none; over, over_max, over_sum: of the first `WANTED` trials those that broke a limit, median, largest and all; of: trials
+    of a run; ask_s: median seconds of a proposal; stopped: seeds on which the tuner refused to go on.
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for one in runs:
