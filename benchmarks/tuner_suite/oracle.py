@@ -20,7 +20,8 @@ __all__ = ["attainable", "within"]
 SHARE = 0.5
 # A solution is worth at least what the oracle's is, less this share of it.
 WITHIN = 0.05
-POINTS, STEPS = 64, ((0.2, 40), (0.05, 25))
+# Points, and steps and generations an entry of theta of each search.
+POINTS, STEPS = 64, ((0.2, 15), (0.05, 12))
 # Cost of one tolerance beyond a limit, in the objective at the start: more than any gain, so that the search ends where limits are kept.
 PENALTY = 10.0
 
@@ -51,7 +52,7 @@ def attainable(plant: SuitePlant, seed: int, cache: Path) -> dict[str, Any]:
     starts = [space.to_unit(np.array(plant.safe_theta)), space.to_unit(space.default), *sobol_points(space.dimension, 0, 0, POINTS)]
     at = min(starts, key=loss)
     for step, generations in STEPS:
-        ends = {"maxiter": generations, "tolfun": 1e-5 * scale, "tolflatfitness": 8}
+        ends = {"maxiter": generations * space.dimension, "tolfun": 1e-5 * scale, "tolflatfitness": 8}
         es = cma.CMAEvolutionStrategy(list(at), step, ends | {"bounds": [0.0, 1.0], "seed": seed + 1, "verbose": -9})
         es.optimize(loss)
         found = space.to_unit(np.array(best[0][1]))

@@ -16,9 +16,9 @@ WANTED = 6
 def rows(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of every plant and method that was run.
 
-    seeds; solved: of them within `WANTED` trials; trials: the median number of trials to the first solution, None where more than half of
-    the seeds have none; over, over_max, over_sum: of the first `WANTED` trials those that broke a limit, median, largest and all; of:
-    trials of a run; ask_s: median seconds of a proposal; stopped: seeds on which the tuner refused to go on.
+    seeds; solved: of them within `WANTED` trials; trials: the median number of trials to the first solution, None where half of them or
+    more have none; over, over_max, over_sum: of the first `WANTED` trials those that broke a limit, median, largest and all; of: trials
+    of a run; ask_s: median seconds of a proposal; stopped: seeds on which the tuner refused to go on.
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for one in runs:
@@ -33,8 +33,8 @@ def solved_at(run: dict[str, Any]) -> float:
 
 def _row(plant: str, method: str, own: list[dict[str, Any]]) -> dict[str, Any]:
     at, over = np.array([solved_at(r) for r in own]), [r["kept"][:WANTED].count(False) for r in own]
-    # The lower of the two middle ones, as of a number of trials there is no half; inf is no number of JSON.
-    middle = float(np.sort(at)[(len(at) - 1) // 2])
+    # The larger of two middle ones, as of a number of trials there is no half; inf is no number of JSON.
+    middle = float(np.sort(at)[len(at) // 2])
     return {
         "plant": plant,
         "method": method,
