@@ -56,7 +56,7 @@ def twins(settings: ct.TwinSettings | None = None) -> dict[str, Method]:
 
 
 # About a third of the seconds: half the plants of each ensemble, half the rounds of the search.
-LIGHT = ct.TwinSettings(plants=32, judges=64, rounds=3, pool=16)
+LIGHT = ct.TwinSettings(plants=32, judges=64, rounds=3)
 
 METHODS: dict[str, Method] = twins() | {
     "composite": Method(lambda p, seed: ct.Composite(p.windows, seed=seed), "chargetune's composite", "windows"),
