@@ -3,7 +3,7 @@ A building with prices
 ======================
 
 Floor heating of a house, every quarter of an hour for two days. Electricity is dear in the morning and in the evening, and at night it
-may be cooler. The stored heat of floor and walls is a battery: a controller that sees price and weather ahead heats before it is dear.
+may be cooler. Floor and walls store heat: a controller that sees price and weather ahead heats before it is dear.
 """
 
 import casadi as ca
@@ -13,7 +13,6 @@ import numpy as np
 import chargetune as ct
 
 HOURS, STEPS, AHEAD = 0.25, 192, 32
-STATES = ("air", "walls", "floor")
 START = {"air": 20.0, "walls": 19.0, "floor": 22.0}
 
 
@@ -25,40 +24,36 @@ def equations(x, u, p):
         warmer = 0.1 * (p["ambient"] - air) + 0.8 * (walls - air) + 1.0 * (floor - air)
         return ca.vertcat(warmer, (0.8 * (air - walls) + 0.05 * (p["ambient"] - walls)) / 8, (1.0 * (air - floor) + u["heat"]) / 3)
 
-    return dict(zip(STATES, ca.vertsplit(ct.rk4(rate, x.vector, HOURS)), strict=True)), x
+    return dict(zip(START, ca.vertsplit(ct.rk4(rate, x.vector, HOURS)), strict=True)), x
 
 
-states = [ct.Signal(name, "degC") for name in STATES]
-house = ct.Model.build(
-    "house", states=states, inputs=[ct.Signal("heat", "kW")], outputs=states, parameters={"ambient": 0.0},
-    sampling_time_s=3600 * HOURS, equations=equations)  # fmt: skip
+states, heat = [ct.Signal(name, "degC") for name in START], [ct.Signal("heat", "kW")]
+how = {"parameters": {"ambient": 0.0}, "sampling_time_s": 3600 * HOURS, "equations": equations}
+house = ct.Model.build("house", states=states, inputs=heat, outputs=states, **how)
 
 # %%
-# The cost is the bill, and a little for the change of the heat. Price, weather and the least temperature are given signals, which the
-# controller sees over its horizon of eight hours. Its inputs are held for half an hour (`blocks`), which halves the work.
+# The cost is the bill, and a little for changes of the heat. Price, weather and the least temperature are given signals: their values
+# come at run time, over the horizon of eight hours as well.
 controller = ct.Controller.build(
-    house, ct.ParameterSpace(()), horizon=AHEAD, blocks=(2,) * (AHEAD // 2), given=[ct.Signal(n) for n in ("price", "ambient", "least")],
-    stage_cost=lambda s: s.given["price"] * s.u["heat"] + 0.002 * (s.u["heat"] - s.u_last["heat"]) ** 2,
+    house, ct.ParameterSpace(()), horizon=AHEAD, given=[ct.Signal(name) for name in ("price", "ambient", "least")], start=START,
+    stage_cost=lambda s: s.given["price"] * s.u["heat"] + 0.005 * (s.u["heat"] - s.u_last["heat"]) ** 2,
     parameters=lambda s: {"ambient": s.given["ambient"]}, input_lower={"heat": 0.0}, input_upper={"heat": 8.0},
-    limits=[ct.SoftLimit("air", lower=lambda s: s.given["least"], upper=25.0, at="end", penalty=50.0, scale=0.1)],
-    start=START)  # fmt: skip
-
+    limits=[ct.SoftLimit("air", lower=lambda s: s.given["least"], at="end", penalty=50.0, scale=0.1)])  # fmt: skip
 hour = HOURS * np.arange(STEPS + AHEAD + 1)
 price = 0.2 + 0.25 * np.isin(hour % 24 // 1, (6, 7, 8, 17, 18, 19))
 given = {"price": price, "ambient": 2 + 5 * np.sin(2 * np.pi * (hour - 9) / 24), "least": np.where((hour + 2) % 24 < 8, 17.0, 20.0)}
-blind = given | {"price": np.full(len(hour), price[:96].mean())}
+unseen = given | {"price": np.full(len(hour), price[:96].mean())}
 
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
-for name, told in {"price seen ahead": given, "price not known": blind}.items():
-    plant = ct.SimulatedPlant(house, START, given=("ambient",))
-    episode = ct.simulate(controller, plant, steps=STEPS, given=told)
-    bill, air = HOURS * price[:STEPS] @ episode.input[:, 0], episode.signal("air")[1]
-    bottom.step(hour[:STEPS], episode.input[:, 0], where="post", label=f"{name}: {bill:.1f} EUR")
-    top.plot(hour[1 : STEPS + 1], air, label=name)
-    print(f"{name}: {bill:.2f} EUR for {HOURS * episode.input.sum():.0f} kWh, least {np.min(air - given['least'][1 : STEPS + 1]):+.2f} K off")
+for name, told in {"price seen ahead": given, "price not known": unseen}.items():
+    episode = ct.run_episode(controller, ct.SimulatedPlant(house, START, given=("ambient",)), steps=STEPS, given=told)
+    bill = HOURS * price[:STEPS] @ episode.input[:, 0]
+    top.plot(hour[1 : STEPS + 1], episode.signal("air")[1], label=f"{name}: {bill:.1f} EUR")
+    bottom.step(hour[:STEPS], episode.input[:, 0], where="post")
+    print(f"{name}: {bill:.2f} EUR for {HOURS * episode.input.sum():.0f} kWh")
 top.step(hour[:STEPS], given["least"][:STEPS], "k:", where="post", label="least")
 for axes in (top, bottom):
     axes.fill_between(hour[:STEPS], 0, 1, where=price[:STEPS] > 0.3, transform=axes.get_xaxis_transform(), color="0.9", step="post")
-    axes.legend(loc="upper right")
 top.set(ylabel="air (°C)")
 bottom.set(xlabel="time (h); grey: electricity is dear", ylabel="heat (kW)")
+figure.legend(loc="outside upper center", ncols=3)

@@ -14,7 +14,6 @@ import numpy as np
 
 import chargetune as ct
 from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import Evaluation
 
 # %%
 # The same plant, the same wrong model, three tuners: points that fill the space, iterative learning, and the twin.
@@ -24,7 +23,7 @@ found = {}
 for tuner, trials in TRIALS.items():
     config = case_study("model", mismatch_seed=1, tuner=tuner)
     with ct.Store(folder / f"{tuner}.sqlite") as store, ct.open_study(store, config) as study:
-        study.run(Evaluation(config.problem()), trials)
+        study.run(ct.evaluation_of(tuner, config.problem()), trials)
         found[tuner] = study.trials()
 
 # %%

@@ -1,9 +1,10 @@
 """
-Your own system: a crane
-========================
+Your own system, safely: a crane
+================================
 
-An overhead crane moves its load 2 m; the load must not swing by more than 0.1 rad. The controller believes in a rope of 0.6 m, the
-crane has 1 m. A system is its equations; everything else is the same as for a battery.
+An overhead crane moves its load 2 m; the load must not swing by more than 0.1 rad, not even while we tune. The rope is 1 m long, which
+nobody knows: 0.8 m is a guess. A twin, the same equations with an unknown rope, learns from the trace of each move, and a theta is tried
+only if the limit is kept on 95 % of the cranes that are still possible. The first move is the most cautious one that theta allows.
 """
 
 import tempfile
@@ -16,45 +17,46 @@ import chargetune as ct
 
 
 def crane(rope_m):
-    """The trolley's acceleration moves the angle: angle'' = -(g sin(angle) + a cos(angle)) / rope."""
-
     def equations(x, u, p):
         def rate(state):
             _, speed, angle, turn = ca.vertsplit(state)
-            swing = -(9.81 * ca.sin(angle) + u["acceleration"] * ca.cos(angle)) / p["rope_m"]
-            return ca.vertcat(speed, u["acceleration"], turn, swing - 0.05 * turn)
+            swing = -(9.81 * ca.sin(angle) + u["acceleration"] * ca.cos(angle)) / p["rope_m"] - 0.05 * turn
+            return ca.vertcat(speed, u["acceleration"], turn, swing)
 
         return dict(zip(x, ca.vertsplit(ct.rk4(rate, x.vector, 0.1, substeps=2)), strict=True)), x
 
     states = [ct.Signal("position", "m"), ct.Signal("speed", "m/s"), ct.Signal("angle", "rad"), ct.Signal("turn", "rad/s")]
-    how = {"parameters": {"rope_m": rope_m}, "sampling_time_s": 0.1, "equations": equations}
-    return ct.Model.build("crane", states=states, inputs=[ct.Signal("acceleration", "m/s2")], outputs=states, **how)
+    how = {"inputs": [ct.Signal("acceleration", "m/s2")], "parameters": {"rope_m": rope_m}, "sampling_time_s": 0.1}
+    return ct.Model.build("crane", states=states, outputs=states, equations=equations, **how)
 
 
 # %%
-# Two entries of theta: a weight in the cost, and the length of the rope in the model.
-rope, weight = ct.Parameter("rope_m", 0.5, 2.0, default=0.6), ct.Parameter("weight", 0.01, 100.0, default=0.1, scale="log")
-space = ct.ParameterSpace((rope, weight))
+# Theta: the length of the rope in the controller's model, and a weight of the swing in its cost.
+space = ct.ParameterSpace((ct.Parameter("rope_m", 0.5, 2.0, default=0.6), ct.Parameter("weight", 0.01, 100.0, default=0.1, scale="log")))
 controller = ct.Controller.build(
     crane(0.6), space, horizon=20, parameters=lambda s: {"rope_m": s.theta["rope_m"]},
     stage_cost=lambda s: (s.x["position"] - 2) ** 2 + 0.1 * s.x["speed"] ** 2 + s.theta["weight"] * s.x["angle"] ** 2,
     input_lower={"acceleration": -1.0}, input_upper={"acceleration": 1.0}, fallback={"acceleration": 0.0},
     limits=[ct.SoftLimit("angle", lower=-0.1, upper=0.1, penalty=1e4, scale=0.1)])  # fmt: skip
-limits = [ct.ScoredLimit("angle", lower=-0.1, upper=0.1, tolerance=1e-3)]
+noise = {"position": 1e-3, "speed": 1e-3, "angle": 1e-4, "turn": 1e-3}
+score = {"limits": [ct.ScoredLimit("angle", -0.1, 0.1, 1e-3)], "objective": lambda e: -0.1 * abs(2 - e.signal("position")[1]).sum()}
+twin = ct.SimulatedTwin.build(controller, crane(0.8), [ct.Uncertain("rope_m", sd=0.3)], noise_sd=noise, steps=60, **score)
 
 
 def evaluate(theta, seed):
-    episode = ct.simulate(controller, ct.SimulatedPlant(crane(1.0), {}), steps=80, theta=theta, seed=seed)
-    return ct.score_limits(episode, limits, objective=lambda e: -0.1 * abs(2 - e.signal("position")[1]).sum(), penalty=0.1)
+    episode = ct.simulate(controller, ct.SimulatedPlant(crane(1.0), {}, ct.Sensors(noise_sd=noise)), steps=60, theta=theta, seed=seed)
+    return ct.score_limits(episode, **score)
 
 
-with ct.Store(Path(tempfile.mkdtemp()) / "crane.sqlite") as store:
-    tuner = ct.ConstrainedLogEI(seed=0)
-    with ct.Study.create_or_resume(store, "crane", config={}, space=space, tuner=tuner) as study:
-        best = study.run(evaluate, 10)
-for name, theta in {"untuned": space.default, "tuned": best.theta}.items():
-    score, episode, _ = evaluate(theta, 0)
-    plt.plot(episode.time_s, episode.signal("angle")[1], label=f"{name}: {score.excess['angle']:+.3f} rad beyond the limit")
-plt.hlines([-0.1, 0.1], 0, 8, colors="black", linestyles=":")
+how = {"config": {}, "space": space, "tuner": ct.TwinTuner(twin, safety=ct.Safety(0.95))}
+with ct.Store(Path(tempfile.mkdtemp()) / "crane.sqlite") as store, ct.Study.create_or_resume(store, "crane", **how) as study:
+    study.run(evaluate, 4)
+    thetas = [space.default, *(trial.theta for trial in study.trials())]
+for number, theta in enumerate(thetas):
+    result, episode, _ = evaluate(theta, 0)
+    name = f"move {number}" if number else "untuned"
+    plt.plot(episode.time_s, episode.signal("angle")[1], "" if number else "k--", label=name)
+    print(f"{name}: {1e3 * result.excess['angle']:+.1f} mrad beyond the limit, rope {theta[0]:.2f} m, objective {result.objective:.2f}")
+plt.axhspan(-0.1, 0.1, alpha=0.1)
 plt.gca().set(xlabel="time (s)", ylabel="swing (rad)")
-plt.legend(loc="upper center", bbox_to_anchor=(0.5, 1.18))
+plt.legend()

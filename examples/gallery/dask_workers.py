@@ -42,13 +42,13 @@ class LongCharge:
 # nothing but time: its trial begins again elsewhere.
 config = case_study("model", mismatch_seed=1, tuner="sobol")
 cluster = LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None)
-with cluster, Client(cluster) as client, client.get_executor() as executor:
-    with ct.Store(Path(tempfile.mkdtemp()) / "study.sqlite") as store, ct.open_study(store, config) as study:
-        study.run(LongCharge(config.problem()), TRIALS, executor=executor, workers=2)
-        trials = study.trials()
+store = ct.Store(Path(tempfile.mkdtemp()) / "study.sqlite")
+with cluster, Client(cluster) as client, client.get_executor() as executor, store, ct.open_study(store, config) as study:
+    study.run(LongCharge(config.problem()), TRIALS, executor=executor, workers=2)
+    trials = study.trials()
 
 # %%
-# When each trial was under way: the store has both times. The colour tells beside how many others it was proposed.
+# When each trial was under way: the store has both times.
 figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
 begun = datetime.fromisoformat(trials[0].asked_at)
 for trial in trials:

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 
 import chargetune as ct
 from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import Evaluation, evaluate, run_charge
+from chargetune.battery.charging.evaluate import evaluate, run_charge
 from chargetune.battery.charging.settings import EstimatorSettings
 
 # %%
@@ -28,7 +28,7 @@ feedback = replace(problem, estimator=EstimatorSettings(kind="offset_free"))
 # Learning with the twin: it fits a model of the plant to every sample, three charges suffice.
 path = Path(tempfile.mkdtemp()) / "study.sqlite"
 with ct.Store(path) as store, ct.open_study(store, config) as study:
-    learnt = study.run(Evaluation(problem), 3)
+    learnt = study.run(ct.evaluation_of("twin", problem), 3)
 
 # %%
 # Untuned the limit of 4.2 V is exceeded; both remedies keep it.

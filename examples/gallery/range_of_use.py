@@ -15,7 +15,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import chargetune as ct
-from chargetune.battery.studies.open_study import evaluation_of
 
 # %%
 # A study file. The controller reads the voltage and estimates how much the resistances are wrong; theta is a margin to the voltage limit
@@ -32,11 +31,9 @@ theta = { backoff = { nodes = 2, lower_V = 0.0, upper_V = 0.1 } }
 folder = Path(tempfile.mkdtemp())
 (folder / "study.toml").write_text(STUDY)
 config = ct.load_config(folder / "study.toml")
-evaluation = evaluation_of("range", config.problem())
+evaluation = ct.evaluation_of("range", config.problem())
 with ct.Store(folder / "study.sqlite") as store, ct.open_study(store, config) as study:
-    study.run(evaluation, 2)
-    best = study.trials()[-1]
-    for t in study.trials(): print(t.theta, t.score.excess, t.score.metrics["violating_plants"],t.ending)
+    best = study.run(evaluation, 2)
 
 # %%
 # Both thetas on 100 cells more, which chose nothing.

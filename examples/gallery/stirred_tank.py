@@ -48,7 +48,7 @@ unseen = np.repeat(price[:steps, None], ahead, axis=1)
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
 for name, forecast in {"price seen ahead": seen, "price as it is now": unseen}.items():
     plant = ct.SimulatedPlant(tank, {"A": 0.5, "B": 0.5}, input_before={"feed": 4.0})
-    episode = ct.simulate(controller, plant, steps=steps, given={"price": forecast})
+    episode = ct.run_episode(controller, plant, steps=steps, given={"price": forecast})
     feed, product = episode.input[:, 0], episode.signal("B")[0]
     profit = TS_MIN * np.sum(price[:steps] * feed * product - 0.5 * feed)
     top.plot(episode.time_s[:steps] / 60, feed, label=name)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from chargetune.battery.identification.pulse_fit import identify
-    from chargetune.battery.studies.open_study import open_study
+    from chargetune.battery.studies.open_study import evaluation_of, open_study
     from chargetune.battery.studies.study_file import load_config
     from chargetune.control.controller import Controller, SoftLimit, Stage
     from chargetune.control.estimators import ExactState, Propagated
@@ -103,6 +103,7 @@ __all__ = [
     "Variation",
     "Windows",
     "__version__",
+    "evaluation_of",
     "from_do_mpc",
     "identify",
     "load_config",
@@ -166,6 +167,7 @@ _MODULES = {
     "Uniform": "plants.variation",
     "Variation": "plants.variation",
     "Windows": "episode.score_limits",
+    "evaluation_of": "battery.studies.open_study",
     "from_do_mpc": "model.do_mpc",
     "identify": "battery.identification.pulse_fit",
     "load_config": "battery.studies.study_file",

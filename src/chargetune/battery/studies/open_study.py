@@ -25,9 +25,10 @@ __all__ = ["evaluation_of", "make_tuner", "open_study"]
 
 
 def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
-    """What a trial of this tuner is: one charge, or with "range" a theta on fresh draws of the range of use.
+    """What a trial of this tuner is, as `Study.run` takes it: ``study.run(evaluation_of(config.study.tuner, config.problem()), 4)``.
 
-    The charge of "twin" over a range is under a condition that the trial's seed draws.
+    One charge; with "range" a theta on fresh draws of the range of use (`RangeEvaluation`); with "twin" over a range one charge under a
+    condition that the trial's seed draws. Raises ValueError for "range" without a range of use, or on an electrochemical plant.
     """
     if name == "twin" and problem.range is not None:
         return RangeCharge(problem)
