@@ -53,7 +53,9 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     # Without CHARGETUNE_GALLERY=1 the pages show the scripts and run none.
     "plot_gallery": os.environ.get("CHARGETUNE_GALLERY") == "1",
-    "within_subsection_order": "FileNameSortKey",
+    "within_subsection_order": "site_pages.GalleryOrder",
+    # A process for each core of the smallest machine; what a script leaves behind (matplotlib's settings, threads) ends with it.
+    "parallel": 2,
     "download_all_examples": False,
     "show_memory": False,
     "capture_repr": (),

@@ -29,18 +29,17 @@ def pendulum():
 # %%
 # The controller: a rod turned at its end, angle'' = 1.5 g sin(angle) / l + 3 torque / (m l^2), g = 10 m/s2, m = 1 kg; its length is theta.
 def equations(x, u, p):
-    speed = x["speed"] + 0.05 * (15 * ca.sin(x["angle"]) / p["length_m"] + 3 * u["torque"] / p["length_m"] ** 2)
+    speed = x["speed"] + 0.05 * (15 * ca.sin(x["angle"]) / p["length"] + 3 * u["torque"] / p["length"] ** 2)
     return {"angle": x["angle"] + 0.05 * speed, "speed": speed}, x
 
 
-rod = ct.Model.build(
-    "rod", states=STATES, inputs=TORQUE, outputs=STATES, parameters={"length_m": 1.5}, sampling_time_s=0.05, equations=equations)  # fmt: skip
-space = ct.ParameterSpace((ct.Parameter("length_m", 0.5, 2.0, default=1.5, unit="m"),))
+how = {"inputs": TORQUE, "outputs": STATES, "parameters": {"length": 1.5}, "sampling_time_s": 0.05, "equations": equations}
+rod = ct.Model.build("rod", states=STATES, **how)
+space = ct.ParameterSpace((ct.Parameter("length", 0.5, 2.0, default=1.5, unit="m"),))
 controller = ct.Controller.build(
-    rod, space, horizon=25, parameters=lambda s: {"length_m": s.theta["length_m"]},
+    rod, space, horizon=25, parameters=lambda s: {"length": s.theta["length"]}, input_lower={"torque": -2.0}, input_upper={"torque": 2.0},
     stage_cost=lambda s: 1 - ca.cos(s.x["angle"]) + 0.05 * s.x["speed"] ** 2 + 0.01 * s.u["torque"] ** 2,
     terminal_cost=lambda s: 10 * (1 - ca.cos(s.x["angle"])) + 0.5 * s.x["speed"] ** 2,
-    input_lower={"torque": -2.0}, input_upper={"torque": 2.0},
     limits=[ct.SoftLimit("speed", lower=-5.0, upper=5.0, at="end", penalty=10.0, scale=0.1)])  # fmt: skip
 limit = ct.ScoredLimit("speed", lower=-5.0, upper=5.0, tolerance=0.25)  # so much a torque so weak cannot prevent
 
@@ -55,7 +54,7 @@ with ct.Store(Path(tempfile.mkdtemp()) / "rod.sqlite") as store, ct.Study.create
     best = study.run(evaluate, 10)
 for name, theta in {"untuned": space.default, "tuned": best.theta}.items():
     score, episode, _ = evaluate(theta, 0)
-    plt.plot(episode.time_s, np.cos(episode.signal("angle")[1]), label=f"{name}: l = {theta[0]:.2f} m")
-    print(f"{name}: {score.excess['speed']:+.2f} rad/s beyond the limit of 5 rad/s")
-plt.gca().set(xlabel="time (s)", ylabel="height of the tip (lengths)", yticks=(-1, 0, 1))
+    label = f"{name}, l = {theta[0]:.2f} m: {score.excess['speed']:+.2f} rad/s beyond the limit"
+    plt.plot(episode.time_s, np.cos(episode.signal("angle")[1]), label=label)
+plt.gca().set(xlabel="time (s)", ylabel="height of the tip (lengths)")
 plt.legend()

@@ -6,8 +6,8 @@ A cell in the cold (PyBaMM's Doyle-Fuller-Newman model at 10 °C, extra `pybamm`
 The controller predicts it from a table that was made at 25 °C, and untuned it plates. Safe mode learns from whole charges how far to stay
 away, and tries only what its model says is safe: the first charge is careful, each one is faster, none breaks the limit.
 
-The charges are short and coarse, that this page is made in seconds; `chargetune tune examples/demo.toml` has five whole ones. A
-downloaded script needs :download:`okane2022_anode.toml <../../examples/okane2022_anode.toml>` beside it.
+The charges are few and coarse, that this page is made in seconds; `chargetune tune examples/demo.toml` has five whole ones. A downloaded
+script or notebook needs the file `okane2022_anode.toml` of the folder `examples` beside it.
 """
 
 import tempfile

@@ -5,8 +5,8 @@ A limit that is not measured in use
 Below 0 V at the anode lithium plates, which ages a cell, the more so in the cold. No charger measures this potential. In the laboratory a
 reference electrode does: two charges with it become a table over the state of charge, and in use the controller predicts by it.
 
-The cell is PyBaMM's Doyle-Fuller-Newman model at 10 °C (extra `pybamm`). What the controller knows of it is an identified circuit:
-:download:`okane2022.toml <../../examples/okane2022.toml>`, which a downloaded script needs beside it.
+The cell is PyBaMM's Doyle-Fuller-Newman model at 10 °C (extra `pybamm`). What the controller knows of it is an identified circuit, the
+file `okane2022.toml` of the folder `examples`, which a downloaded script or notebook needs beside it.
 """
 
 import tempfile

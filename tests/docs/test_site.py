@@ -1,5 +1,6 @@
 """The site: every public name has a page, every page is in the menu, links lead where they should. `make docs` builds it."""
 
+import re
 import runpy
 from pathlib import Path
 
@@ -98,8 +99,40 @@ def test_a_default_that_is_made_anew_can_be_parsed():
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
-def test_a_script_of_the_gallery_is_short_and_has_a_title(script):
-    lines = script.read_text(encoding="utf-8").splitlines()
+def test_a_script_of_the_gallery_is_short_has_a_title_and_draws(script):
+    """`make gallery` runs them, and stops at the first error."""
+    text = script.read_text(encoding="utf-8")
+    lines = text.splitlines()
     assert len(lines) <= 60
     assert lines[0] == '"""'
     assert lines[2] == "=" * len(lines[1])
+    # The picture of its page: drawn by pyplot, which sphinx-gallery collects, with what is on both axes.
+    assert re.search(r"plt\.(subplots|figure|plot)\(", text)
+    assert re.search(r"xlabel=.*ylabel=|ylabel=(.|\n)*xlabel=", text)
+
+
+def test_every_script_of_the_gallery_has_its_place():
+    assert sorted(SITE["GALLERY"]) == [script.stem for script in SCRIPTS]
+    assert len(SCRIPTS) >= 14
+    order = SITE["GalleryOrder"](str(SCRIPTS[0].parent))
+    assert sorted(SCRIPTS, key=order)[0].stem == SITE["GALLERY"][0]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_a_script_of_the_gallery_opens_as_a_notebook(script):
+    """As sphinx-gallery makes it for its page: every line of code is in a cell, and the title is a heading."""
+    pytest.importorskip("sphinx_gallery", reason="in the extra docs")
+    from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
+    from sphinx_gallery.notebook import jupyter_notebook
+    from sphinx_gallery.py_source_parser import split_code_and_text_blocks
+
+    blocks = split_code_and_text_blocks(str(script))[1]
+    cells = jupyter_notebook(blocks, DEFAULT_GALLERY_CONF, str(script.parent))["cells"]
+    title = script.read_text(encoding="utf-8").splitlines()[1]
+    text = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    assert text.startswith(f"\n# {title}\n")
+    assert ":download:" not in text
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    for cell in code:
+        compile(cell, script.name, "exec")
