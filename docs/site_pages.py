@@ -72,6 +72,10 @@ def led(text, origin, page):
             return match[0]
         file = _plain(PurePosixPath(origin).parent / path)
         there = f"docs/{PAGES[file]}" if file in PAGES else file
+        if file.startswith("examples/gallery/") and (ROOT / file).exists():
+            # Its page is made from it when the site is built.
+            there = f"docs/gallery/{PurePosixPath(file).stem.replace('README', 'index')}.rst"
+            return f"[{label}]({_relative(there, PurePosixPath(page).parent)})"
         way = _relative(there, PurePosixPath(page).parent)
         if image or not (ROOT / there).exists() or (there.endswith(".md") and there.startswith("docs/")):
             return f"{image}[{label}]({way}{mark}{anchor})"

@@ -59,6 +59,8 @@ def test_every_page_is_in_the_menu():
         ("[a](../README.md)", "docs/learning.md", "[a](index.md)"),
         ("[a](../CHANGELOG.md)", "docs/learning.md", "[a](changes.md)"),
         ("[`a`](../examples/custom_system.py)", "docs/learning.md", "{download}`a <../examples/custom_system.py>`"),
+        ("[a](../../examples/gallery/crane.py)", "docs/how-to/own-system.md", "[a](../gallery/crane.rst)"),
+        ("[a](../examples/gallery/README.rst)", "docs/learning.md", "[a](gallery/index.rst)"),
         ("![a](learning.png)", "docs/learning.md", "![a](learning.png)"),
         ("[a](https://example.org/a.md)", "docs/learning.md", "[a](https://example.org/a.md)"),
         ("[a](#b)", "docs/learning.md", "[a](#b)"),
@@ -115,7 +117,7 @@ def test_every_script_of_the_gallery_has_its_place():
     assert sorted(SITE["GALLERY"]) == [script.stem for script in SCRIPTS]
     assert len(SCRIPTS) >= 14
     order = SITE["GalleryOrder"](str(SCRIPTS[0].parent))
-    assert sorted(SCRIPTS, key=order)[0].stem == SITE["GALLERY"][0]
+    assert min(SCRIPTS, key=order).stem == SITE["GALLERY"][0]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
