@@ -41,6 +41,7 @@ class LongCharge:
 # With `workers=2` there are always two trials under way: as soon as one is told, the next theta is proposed. A worker that dies costs
 # nothing but time: its trial begins again elsewhere.
 config = case_study("model", mismatch_seed=1, tuner="sobol")
+evaluate(config.problem(), None, 0)  # compiles the charge
 cluster = LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0")
 store = ct.Store(Path(tempfile.mkdtemp()) / "study.sqlite")
 with cluster, Client(cluster) as client, client.get_executor() as executor, store, ct.open_study(store, config) as study:

@@ -57,4 +57,4 @@ for name, theta in {"untuned": space.default, "tuned": best.theta}.items():
     label = f"{name}, l = {theta[0]:.2f} m: {score.excess['speed']:+.2f} rad/s beyond the limit"
     plt.plot(episode.time_s, np.cos(episode.signal("angle")[1]), label=label)
 plt.gca().set(xlabel="time (s)", ylabel="height of the tip (lengths)")
-plt.legend()
+plt.legend(loc="lower center", bbox_to_anchor=(0.5, 1))
