@@ -48,11 +48,7 @@ def evaluate(theta, seed):
     return ct.score_limits(ct.run_episode(controller, plant, steps=60, theta=theta, seed=seed), **score)
 
 
-<<<<<<< HEAD
-tuner = ct.TwinTuner(twin, safety=ct.Safety(0.95), settings=ct.TwinSettings(plants=32, judges=64, rounds=2, pool=8))  # a short search
-=======
 tuner = ct.TwinTuner(twin, safety=ct.Safety(0.95), settings=ct.TwinSettings(plants=32, judges=64, rounds=2))  # a short search
->>>>>>> wt-gal
 how = {"config": {}, "space": space, "tuner": tuner}
 with ct.Store(Path(tempfile.mkdtemp()) / "crane.sqlite") as store, ct.Study.create_or_resume(store, "crane", **how) as study:
     study.run(evaluate, 4)
