@@ -32,6 +32,7 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "aim": {"aim": 1.0},
     # Fewer plants judge than the candidates were chosen by.
     "judges": {"judges": 16},
+    "pool": {"pool": 1},
     "steps back": {"steps_back": (0.25,)},
 }
 

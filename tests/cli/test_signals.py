@@ -99,7 +99,8 @@ def test_a_command_that_keeps_nothing_does_not_say_that_it_resumes(tmp_path):
         _, err = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert process.returncode == 130
+    # Python ends itself by the signal where that came while a dataclass was made; a shell says 130 then, too.
+    assert process.returncode in (130, -signal.SIGINT)
     assert "what runs is given up; a second Ctrl-C ends at once" in err
     assert "resumes" not in err
 

@@ -201,7 +201,7 @@ def test_a_twin_that_is_none_repeats_the_best_trial_and_says_so():
 def test_errors_beyond_every_scale_are_said():
     proposal, theta = after_one_trial()
     beyond = PredictionCheck(np.where(np.arange(len(SCALES)) == len(SCALES) - 1, 0.0, -1e3), 1.0)
-    proposal = replace(proposal, ensemble=replace(proposal.ensemble, checks=(beyond,)))
+    proposal = replace(proposal, ensemble=replace(proposal.ensemble, learnt=replace(proposal.ensemble.learnt, checks=(beyond,))))
     with pytest.warns(RuntimeWarning, match="times as large as stated"):
         np.testing.assert_array_equal(safe_thetas(proposal, Safety()), [theta])
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import windows_of
 from chargetune.learning.closed_loop.search import Search
+from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.ensemble import Ensemble, Prediction
 from chargetune.model.parameter_space import ParameterSpace
@@ -124,7 +125,9 @@ class Proposal:
 
     @property
     def _start(self) -> NDArray[np.float64]:
-        """The best on the expected plant of the thetas tried so far and theta_0."""
-        points = [*(self.space.to_unit(np.array(t.theta)) for t in self.trials), self.space.to_unit(self.space.default)]
+        """The best on the expected plant of the thetas tried so far, theta_0 and Sobol's points."""
+        space = self.space
+        pool = sobol_points(space.dimension, self.seed, 0, self.ensemble.settings.pool)
+        points = [*(space.to_unit(np.array(t.theta)) for t in self.trials), space.to_unit(space.default), *pool]
         self.expected.scores(points)
         return min(points, key=self.expected.merit)

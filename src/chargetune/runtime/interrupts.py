@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from types import FrameType
 
@@ -48,17 +48,15 @@ def handled_interrupts(watch: Watch | None = None) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, _interrupt) for number in NUMBERS}
-    try:
-        if watch is None:
+    # The watch first: a signal that comes between the two is said, too.
+    with nullcontext() if watch is None else _watched(watch):
+        before = {number: signal.signal(number, _interrupt) for number in NUMBERS}
+        try:
             yield
-        else:
-            with _watched(watch):
-                yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        _came.clear()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            _came.clear()
 
 
 def raise_lost_interrupt() -> None:

@@ -41,6 +41,8 @@ class TwinSettings:
         Of the search in one round, and the share of the objective that an iteration has to win. A measured time is worth no more.
     proximal
         Share of the objective that moving one entry of theta over its whole range has to win: what is not needed stays as it was tried.
+    pool
+        Sobol points from which a search may begin beside the thetas that were tried: from theta_0 alone a plant may be a plateau.
     steps_back
         Shares of the way from a safe theta to one that is not, tried in this order.
     """
@@ -61,10 +63,11 @@ class TwinSettings:
     iterations: int = 15
     gain: float = 1e-3
     proximal: float = 1e-3
+    pool: int = 32
     steps_back: tuple[float, ...] = (0.8, 0.5, 0.25)
 
     def __post_init__(self) -> None:
-        for name in ("traces", "bins", "plants", "judges", "rounds", "iterations"):
+        for name in ("traces", "bins", "plants", "judges", "rounds", "iterations", "pool"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is an integer >= 1")
