@@ -144,13 +144,14 @@ def environment(folder, names, own=None):
     if own is not None:
         for entry in site_of(own).glob("chargetune*"):
             (site / entry.name).symlink_to(entry)
-    for name, files in FILES.items():
-        for top in {file.parts[0] for file in files} if name in names else ():
+    for name in names:
+        found = distribution(name)
+        for top, files in INSTALLED[name].items():
             # A folder that several distributions share is made of links to its files.
-            alone = [other for other, theirs in FILES.items() if any(file.parts[0] == top for file in theirs)] == [name]
-            for file in [Path(top)] if alone else [file for file in files if file.parts[0] == top]:
+            alone = sum(top in theirs for theirs in INSTALLED.values()) == 1
+            for file in [top] if alone else files:
                 (site / file).parent.mkdir(parents=True, exist_ok=True)
-                (site / file).symlink_to(distribution(name).locate_file(file))
+                (site / file).symlink_to(found.locate_file(file))
     return folder / "bin" / "python"
 
 
@@ -160,12 +161,15 @@ def site_of(folder):
 
 
 def installed_files():
-    """Files of each locked distribution, below site-packages."""
-    files = {}
-    for found in distributions():
-        inside = [Path(file) for file in found.files or () if file.parts[0] not in ("..", "__pycache__")]
-        files[canonicalize_name(found.name)] = inside
-    return files
+    """Of each locked distribution: its files, by the entry of site-packages that they are or lie in."""
+    found = {}
+    for one in distributions():
+        tops = found.setdefault(canonicalize_name(one.name), {})
+        for file in map(str, one.files or ()):
+            top = file.partition("/")[0]
+            if top not in ("..", "__pycache__"):
+                tops.setdefault(top, []).append(file)
+    return found
 
 
 def run(python, words, where, *, fails=False, warnings=()):
@@ -296,5 +300,5 @@ if __name__ == "__main__":
     os.chdir(ROOT)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--core", action="store_true", help="leave out the extras and the type checker")
-    FILES = installed_files()
+    INSTALLED = installed_files()
     main(core_only=parser.parse_args().core)
