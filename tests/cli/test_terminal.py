@@ -10,7 +10,7 @@ from commands import chargetune
 from rich.console import Console
 
 from chargetune.cli.terminal import any_terminal
-from chargetune.cli.tune import bar
+from chargetune.cli.tune import bar, progress_note
 from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -53,6 +53,20 @@ def test_counts_and_times_of_a_bar_stand_whole_at_80_columns(done):
     assert "…" not in text
     assert "[violating]" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("best", ["t95 137.11 min (trial 299)", ""])
+@pytest.mark.parametrize("failures", [0, 12])
+@pytest.mark.parametrize("total", [60, 300])
+def test_the_bar_of_a_study_is_one_line_at_80_columns(best, failures, total):
+    progress = bar(quiet=False)
+    progress.add_task("", total=total, completed=total - 1, note=progress_note(best, 41, failures))
+    screen = Console(width=80, color_system=None)
+    with screen.capture() as captured:
+        screen.print(progress.get_renderable())
+    (line,) = captured.get().splitlines()
+    assert progress_note(best, 41, failures) in line
+    assert ("failed" in line) == (failures > 0)
 
 
 def test_a_warning_is_one_line_and_said_once(capsys):

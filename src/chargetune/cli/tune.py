@@ -47,7 +47,7 @@ def bar(*, quiet: bool) -> Progress:
     """A progress bar on stderr, so that a program can read stdout. At 80 columns the note is what goes on in a second line."""
     columns = (
         TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
-        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=5, table_column=Column(no_wrap=True)),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
@@ -155,17 +155,18 @@ def _run(
         workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
-        task = progress.add_task("tuning", total=count, completed=min(done, count), note="")
+        # Without a word before it the line of a trial is whole at 80 columns.
+        task = progress.add_task("", total=count, completed=min(done, count), note="")
         if study.earlier and not quiet:
             progress.console.print(f"begun with {len(study.earlier)} trials of earlier studies")
         if done and not quiet:
             progress.console.print(f"resumed: {done} trials are in {shown(kept)}", markup=False, soft_wrap=True)
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
-            best = "none within the limits yet"
+            best = ""
             if incumbent is not None and incumbent.score is not None:
-                best = f"best {_headline(config, problem, incumbent.score)} (trial {incumbent.number})"
-            progress.update(task, advance=1, note=f"{best}, {violating} violating, {failures} failed")
+                best = f"{_headline(config, problem, incumbent.score)} (trial {incumbent.number})"
+            progress.update(task, advance=1, note=progress_note(best, violating, failures))
 
         stack.enter_context(_said(progress.console))
         # A tuner has loaded this folder by now.
@@ -184,6 +185,12 @@ def _run(
         study.result()
         result = read_result(store, study.record, everything)
     return everything, more, result, safety
+
+
+def progress_note(best: str, violating: int, failures: int) -> str:
+    """What a bar says of the trials so far, in about 50 characters; failures only where there are some."""
+    said = f"best {best}" if best else "none within limits"
+    return f"{said}, {violating} over" + f", {failures} failed" * (failures > 0)
 
 
 def _headline(config: Config, problem: ChargingProblem, score: Score) -> str:

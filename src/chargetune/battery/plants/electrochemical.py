@@ -5,13 +5,14 @@ The only module that imports pybamm, and only when a plant is made.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -103,6 +104,10 @@ class Electrochemical:
     def file(self) -> str:
         """Path of the BPX file; empty for a named set."""
         return self.parameters if Path(self.parameters).suffix.lower() == ".json" else ""
+
+    def bpx(self) -> Any:
+        """Content of the BPX file. Raises OSError, ValueError."""
+        return json.loads(Path(self.file).read_bytes().decode("utf-8-sig"))
 
     @property
     def line(self) -> str:
@@ -324,7 +329,7 @@ _ACTIVE = tuple(f"{side} electrode active material volume fraction" for side in 
 
 
 def _without(settings: Electrochemical) -> Electrochemical:
-    return Electrochemical(**{**settings.__dict__, "resistance_scale": 1.0})
+    return replace(settings, resistance_scale=1.0)
 
 
 def _parameters(settings: Electrochemical) -> Any:
@@ -332,13 +337,17 @@ def _parameters(settings: Electrochemical) -> Any:
     import pybamm
 
     if settings.file:
-        if not Path(settings.parameters).is_file():
-            raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file")
+        try:
+            content = settings.bpx()
+        except FileNotFoundError as error:
+            raise SetUpError(f"electrochemical plant: parameters = {settings.parameters!r}: there is no such file") from error
+        except (OSError, ValueError) as error:
+            raise SetUpError(f"electrochemical plant: {settings.parameters} is no BPX file: {error}") from error
         try:
             with warnings.catch_warnings():
                 # That the file's cut-off voltages stand for the OCV at SOC 0 and 1 where it has none of these, as docs/cells.md says.
                 warnings.filterwarnings("ignore", message=".*not found in BPX file", category=UserWarning)
-                return pybamm.ParameterValues.create_from_bpx(settings.parameters)
+                return pybamm.ParameterValues.create_from_bpx_obj(content)
         except Exception as error:
             # Its parser raises what pydantic, json and pybamm raise.
             raise SetUpError(f"electrochemical plant: {Path(settings.parameters).name} is no BPX file: {error}") from error

@@ -29,6 +29,7 @@ from chargetune.battery.charging.settings import (
     SensorSettings,
 )
 from chargetune.battery.charging.tunables import Tunables
+from chargetune.battery.plants.bpx import BpxCell, read_bpx
 from chargetune.battery.plants.circuit import Circuit
 from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.studies.file_errors import plain_errors
@@ -108,6 +109,9 @@ PlantTable = Annotated[
     Annotated[Electrochemical, Tag(MODEL_PLANT)] | Annotated[PlantCellTable, Tag(CELL_PLANT)], Discriminator(_kind_of_plant)
 ]
 
+# What a problem is made with: those tables with the content of the files that they name.
+Plant = Circuit | Electrochemical
+
 
 class TwinTable(_Table):
     """What is unknown of the plant before the first trial, as standard deviations: for the tuner "twin".
@@ -156,14 +160,14 @@ class Config(_Table):
     range: ChargingRangeSettings | None = None
     """What differs between the cells and charges that the controller will meet."""
 
-    def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant_cell: Cell | None = None) -> ChargingProblem:
-        """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant_cell`` stand in for the files'.
+    def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant: Plant | None = None) -> ChargingProblem:
+        """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant`` stand in for the files'.
 
         Raises ValueError, FileNotFoundError.
         """
         return ChargingProblem(
             cell=cell or self._cell(folder),
-            plant=Circuit(plant_cell) if plant_cell else self._plant(folder),
+            plant=plant or self._plant(folder),
             controller=self.controller,
             estimator=self.estimator,
             limits=self.limits,
@@ -192,7 +196,7 @@ class Config(_Table):
         if isinstance(plant, Circuit):
             data["plant"] = {"cell": _cell_document(plant.cell)}
         elif plant is not None:
-            data["plant"] = asdict(plant)
+            data["plant"] = plant.document() if isinstance(plant, BpxCell) else asdict(plant)
         data["theta"].pop("values")
         data["study"] = {"tuner": self.study.tuner}
         # What is not given leaves no entry, that studies of before it resume.
@@ -230,13 +234,13 @@ class Config(_Table):
         cell = default_cell() if table.file is None else load_cell(_beside(folder, table.file))
         return replace(cell, series=table.series or cell.series, parallel=table.parallel or cell.parallel)
 
-    def _plant(self, folder: Path | None) -> Circuit | Electrochemical | None:
+    def _plant(self, folder: Path | None) -> Plant | None:
         plant = self.plant
         if isinstance(plant, PlantCellTable):
             return Circuit(load_cell(_beside(folder, plant.cell)))
         if plant is not None and plant.file:
-            # A worker, and a later command on the store, may begin in another folder.
-            return replace(plant, parameters=str(_beside(folder, plant.file).absolute()))
+            # A worker, and a later command on the store, may run where the file is not.
+            return read_bpx(plant, _beside(folder, plant.file))
         return plant
 
 
@@ -314,9 +318,15 @@ def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
     tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
     plant = tables.get("plant")
-    other = _cell_of_document(tables.pop("plant")["cell"]) if isinstance(plant, Mapping) and "cell" in plant else None
+    made: Plant | None = None
+    if isinstance(plant, Mapping) and "cell" in plant:
+        made = Circuit(_cell_of_document(tables.pop("plant")["cell"]))
+    elif isinstance(plant, Mapping) and "content" in plant:
+        made = BpxCell.of_document(tables.pop("plant"))
     config = Config.model_validate_json(json.dumps(_migrated(tables)))
-    return config.problem(cell=_cell_of_document(document["cell"]), plant_cell=other)
+    # A store of before the content was kept has the path, which is read when the plant is built.
+    by_path = config.plant if isinstance(config.plant, Electrochemical) else None
+    return config.problem(cell=_cell_of_document(document["cell"]), plant=made or by_path)
 
 
 def _cell_of_document(data: Mapping[str, Any]) -> Cell:
