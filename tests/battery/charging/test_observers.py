@@ -243,7 +243,11 @@ def test_the_check_of_a_problem_tells_of_it():
             ["'resistance_start_sd'", "offset_drift_V"],
         ),
         (lambda: problem("open_loop", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["'voltage_sd_V'", "(none)"]),
-        (lambda: problem("offset_free", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)), ["voltage_sd_V = 0.002", "[0.1, 1]"]),
+        (
+            lambda: problem("offset_free", observer=(ObserverSetting("voltage_sd_V", 0.1, 1.0),)),
+            ["estimator.offset_free: voltage_sd_V = 0.002", "[0.1, 1] V (what"],
+        ),
+        (lambda: problem("offset_free", observer=(ObserverSetting("backoff_sd", 4.0, 5.0),)), ["backoff_sd = 3.0", "[4, 5] (what"]),
         (lambda: problem("offset_free", observer=(ObserverSetting("backoff_sd", 0.1, 5.0),) * 2), ["backoff_sd", "different names"]),
         (lambda: problem("open_loop", current_ramp_A_s=0.0), ["current_ramp_A_s = 0.0"]),
         (lambda: problem("open_loop", current_ramp=CurrentRamp(0.01, 1.0)), ["theta.current_ramp", "current_ramp_A_s", "[0.01, 1] A/s"]),

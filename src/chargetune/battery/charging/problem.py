@@ -136,7 +136,9 @@ class ChargingProblem:
             if not isinstance(self.estimator.settings, Kalman):
                 raise ValueError("theta.voltage_sd is given without estimator.kalman: only a Kalman filter has a spread to tune")
             own = self.estimator.settings.voltage_sd_V
-            check_number("kalman: voltage_sd_V", own, theta.voltage_sd.lower_V, theta.voltage_sd.upper_V, "V, which theta.voltage_sd spans")
+            check_number(
+                "estimator.kalman: voltage_sd_V", own, theta.voltage_sd.lower_V, theta.voltage_sd.upper_V, "V (what theta.voltage_sd spans)"
+            )
 
         ramp = self.controller.current_ramp_A_s
         if theta.current_ramp is not None:
@@ -146,7 +148,7 @@ class ChargingProblem:
                     "theta.current_ramp is given without controller.current_ramp_A_s, allowed is the untuned ramp there, "
                     f"in [{low:g}, {high:g}] A/s"
                 )
-            check_number("controller: current_ramp_A_s", ramp, low, high, "A/s, which theta.current_ramp spans")
+            check_number("controller: current_ramp_A_s", ramp, low, high, "A/s (what theta.current_ramp spans)")
         numbers = self._observer_numbers
         for part in theta.observer:
             if part.name not in numbers or isinstance(self.estimator.settings, Kalman):
@@ -154,7 +156,10 @@ class ChargingProblem:
                     f"theta.observer names {part.name!r}, allowed are numbers of the estimator of kind {self.estimator.kind!r}: "
                     f"{', '.join(numbers) or '(none)'}"
                 )
-            check_number(f"estimator: {part.name}", numbers[part.name], part.lower, part.upper, ", which theta.observer spans")
+            # The unit is the last word of most names.
+            unit = next((f"{unit} " for unit in ("V", "K") if part.name.endswith(f"_{unit}")), "")
+            own = f"estimator.{self.estimator.kind}: {part.name}"
+            check_number(own, numbers[part.name], part.lower, part.upper, f"{unit}(what theta.observer spans)")
 
         thermal, adaptive = self.cell.thermal is not None, self.estimator.kind == "adaptive"
         for name, over in theta.over.items():
