@@ -131,9 +131,13 @@ def _compiled_code(request, monkeypatch):
 
 
 @pytest.fixture
-def virtual_machine(monkeypatch):
-    """Problems that run a few times are not worth a compilation, which takes as long as a hundred charges."""
-    monkeypatch.setenv("CHARGETUNE_CC", "none")
+def virtual_machine(request, monkeypatch):
+    """Problems that run a few times are not worth a compilation, which takes as long as a hundred charges.
+
+    Of a whole module it is asked with ``pytestmark``; there a test marked `compiled_code` is compiled all the same.
+    """
+    if request.node.get_closest_marker("compiled_code") is None:
+        monkeypatch.setenv("CHARGETUNE_CC", "none")
 
 
 @pytest.fixture(params=["straight-line code", "loops"])

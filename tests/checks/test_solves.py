@@ -12,6 +12,8 @@ from chargetune.episode.score_limits import ScoredLimit, score_limits
 from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 SPACE = ParameterSpace((Parameter("weight", 0.01, 1.0, 0.1),))
 STEPS = 12
 TOLD = {"ambient": 5.0 + 3.0 * np.cos(0.5 * np.arange(STEPS)), "least": np.where(np.arange(STEPS) < 6, 18.0, 20.0)}

@@ -14,6 +14,8 @@ from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import Parameter, ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 NONE = ParameterSpace(())
 
 

@@ -13,6 +13,8 @@ from chargetune.model.model import Model, Signal
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.plants.simulated import SimulatedPlant
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 
 def tanks(offset=0.0, inflow=0.0, factor=1.0):
     """Two tanks in a row; the plant's gauge, pump and valves are off by these."""

@@ -1,10 +1,13 @@
 """What `chargetune reproduce rbf` says of its rows."""
 
 import numpy as np
+import pytest
 
 from chargetune.battery.case_study.configurations import case_study
 from chargetune.battery.case_study.radial_basis import by_way, decide_claims, oracle, safe_study
 from chargetune.battery.charging.evaluate import evaluate
+
+pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 
 def figures(mV, t80=None, t95=None):

@@ -23,6 +23,8 @@ from chargetune.episode.stepwise import run_episode
 from chargetune.model.detectability import undetectable
 from charging_problems import changed, charging_problem
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 CELL = default_cell()
 KINDS = {"offset_free": OffsetFree, "adaptive": Adaptive}
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -118,6 +120,7 @@ def test_a_counted_soc_follows_the_controllers_own_capacity():
     np.testing.assert_allclose(episode.estimate[1:, 0], episode.estimate[0, 0] + charge, atol=1e-9)
 
 
+@pytest.mark.compiled_code(quick=True)
 @pytest.mark.parametrize("kind", ["offset_free", "adaptive"])
 def test_compiled_and_step_by_step_are_one_loop(kind):
     own = problem(kind, 1, steps=40, voltage_noise_sd_V=0.002, current_ramp_A_s=0.1)

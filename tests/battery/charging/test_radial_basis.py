@@ -13,6 +13,8 @@ from chargetune.control.ipopt_reference import ipopt_act
 from chargetune.episode.stepwise import run_episode
 from charging_problems import charging_problem
 
+pytestmark = pytest.mark.usefixtures("virtual_machine")
+
 RNG = np.random.default_rng(0)
 WEIGHTS = RNG.uniform(-0.05, 0.05, 16)
 # The weights of a cost that keeps the limit on mismatch seed 1: slopes at the highest voltage centres.

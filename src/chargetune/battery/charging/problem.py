@@ -158,8 +158,8 @@ class ChargingProblem:
                 )
             # The unit is the last word of most names.
             unit = next((f"{unit} " for unit in ("V", "K") if part.name.endswith(f"_{unit}")), "")
-            own = f"estimator.{self.estimator.kind}: {part.name}"
-            check_number(own, numbers[part.name], part.lower, part.upper, f"{unit}(what theta.observer spans)")
+            name = f"estimator.{self.estimator.kind}: {part.name}"
+            check_number(name, numbers[part.name], part.lower, part.upper, f"{unit}(what theta.observer spans)")
 
         thermal, adaptive = self.cell.thermal is not None, self.estimator.kind == "adaptive"
         for name, over in theta.over.items():
