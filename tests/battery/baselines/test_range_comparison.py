@@ -1,15 +1,16 @@
 """Ways of charging on drawn plants, against what is known of them."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from chargetune.battery.baselines.comparison import CCCV, smallest_that_keeps
+from chargetune.battery.baselines.comparison import CCCV, ConstantBackoffs, smallest_that_keep
 from chargetune.battery.baselines.range_comparison import ORACLE, RangeRow, compare_range, range_row_names
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.evaluate import run_charge
+from chargetune.battery.charging.observers import OffsetFree
 from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.charging.verdict import score_episode
@@ -85,13 +86,54 @@ def test_figures_of_a_row_by_hand():
     assert (ended.violations, ended.mean("t80_min")) == (2, None)
 
 
-@pytest.mark.parametrize(("edge", "expected"), [(-1.0, 0.0), (0.1, 0.1), (0.9, 0.3)])
-def test_the_smallest_value_is_found(edge, expected):
-    class Run:
-        def __init__(self, value):
-            self.value, self.breaks_limit = value, value < edge
+@dataclass
+class Run:
+    """Each limit is kept where its value is at least its edge, and all together where their sum is at most ``most``."""
 
-    assert smallest_that_keeps(Run, 0.3).value == pytest.approx(expected, abs=5e-4)
+    values: list[float]
+    edges: tuple[float, ...]
+    most: float = 99.0
+
+    def breaks(self, limit):
+        return self.values[int(limit)] < self.edges[int(limit)]
+
+    @property
+    def breaks_limit(self):
+        return any(map(self.breaks, "01"[: len(self.edges)])) or self.most < sum(self.values) < 5.3
+
+
+@pytest.mark.parametrize(
+    ("edges", "most", "expected"),
+    [
+        ((-1.0,), 99.0, [0.0]),
+        ((0.1,), 99.0, [0.1]),
+        ((0.9,), 99.0, [0.3]),
+        ((0.1, 2.0), 99.0, [0.1, 2.0]),
+        ((-1.0, 2.0), 99.0, [0.0, 2.0]),
+        ((0.1, -1.0), 99.0, [0.1, 0.0]),
+        ((0.9, 1.0), 99.0, [0.3, 5.0]),
+        ((0.1, 2.0), 2.05, [0.3, 5.0]),
+    ],
+)
+def test_the_smallest_values_are_found(edges, most, expected):
+    largest, tolerances = [0.3, 5.0][: len(edges)], [5e-4, 0.05][: len(edges)]
+    found = smallest_that_keep(lambda values: Run(list(values), edges, most), "01"[: len(edges)], largest, tolerances).values
+    assert all(abs(one - wanted) <= tolerance for one, wanted, tolerance in zip(found, expected, tolerances, strict=True))
+
+
+def test_each_limit_that_the_controller_keeps_has_its_own_backoff():
+    """A cell whose temperature is limited as well: the smallest margins to both, in a table with both units."""
+    warm = replace(CELL, thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05))
+    problem = charging_problem(warm, mismatch_seed=1, horizon=3, steps=150, temperature_max_K=306.0, kind="offset_free")
+    backoffs = ConstantBackoffs(replace(problem, estimator=replace(problem.estimator, offset_free=OffsetFree(backoff_sd=0.0))))
+    assert backoffs.of == ("voltage", "temperature")
+    assert backoffs.setting([0.0104, 0.301]) == "voltage 10.4 mV, temperature 0.30 K"
+    assert backoffs.problem.space.entries == ("backoff_V[0]", "backoff_V[1]", "temperature_backoff_K")
+    assert backoffs.theta([0.01, 0.3]) == [0.01, 0.01, 0.3]
+    (row,) = compare_range(replace(backoffs.plain, range=USE), rows=["best constant backoff"], draws=4)
+    assert row.violations == 0
+    assert -1e-3 <= row.worst_excess("voltage_max_V") <= 5e-4
+    assert -0.15 <= row.worst_excess("temperature_max_K") <= 0.05
 
 
 def test_without_a_range_nothing_is_drawn():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -13,15 +13,15 @@ import numpy as np
 from chargetune.battery.baselines.charging_protocols import ATTIA_RATES, CurrentLaw, charge, constant_current, four_step, multi_step
 from chargetune.battery.charging.evaluate import plant_of, run_charge
 from chargetune.battery.charging.problem import ChargingProblem, knowing_the_plant, with_feedback
-from chargetune.battery.charging.tunables import Backoff, Tunables
+from chargetune.battery.charging.tunables import Backoff, LimitBackoff, Tunables
 from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
 __all__ = [
-    "CCCV", "FEEDBACK", "Row", "Verdict", "chosen_rows", "compare", "constant_backoff", "largest_share", "plant_oracle", "row_names",
-    "smallest_that_keeps",
+    "CCCV", "FEEDBACK", "ConstantBackoffs", "Row", "Verdict", "chosen_rows", "compare", "largest_share", "plant_oracle", "row_names",
+    "smallest_that_keep",
 ]  # fmt: skip
 
 # CC-CV at the fastest rate with which every limit is kept.
@@ -34,9 +34,8 @@ RATE_TOLERANCE = 1 / 64
 # Shares of the largest current: of CC-CV, and of five steps in five equal SOC windows.
 CCCV_SHARES = (0.25, 0.5, 1.0)
 STEP_SHARES = (1.0, 2.5 / 3, 2 / 3, 0.5, 1 / 3)
-# The best constant backoff is found to this, V.
-BACKOFF_TOLERANCE_V = 5e-4
-BACKOFF_MAX_V = 0.3
+# By what is limited: the largest constant backoff that is tried, and to what the smallest one is found, both in the unit of the limit.
+BACKOFFS = {"voltage": (0.3, 5e-4), "temperature": (5.0, 0.05), "anode": (0.1, 5e-4)}
 
 
 @dataclass(frozen=True)
@@ -65,9 +64,11 @@ class Row:
 
         Noise is one standard deviation of the sensor: a controller that was tuned on noisy measurements knows no better.
         """
-        if self.score is None:
-            return True
-        return any(value > self.score.tolerance[name] + self.noise.get(name, 0.0) for name, value in self.score.excess.items())
+        return self.score is None or any(map(self.breaks, self.score.excess))
+
+    def breaks(self, limit: str) -> bool:
+        """The same of one limit."""
+        return self.score is None or self.score.excess[limit] > self.score.tolerance[limit] + self.noise.get(limit, 0.0)
 
 
 def row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
@@ -177,18 +178,68 @@ def _judged(problem: ChargingProblem, name: str, episode: Episode, setting: str 
 
 
 def _best_backoff(plain: ChargingProblem, name: str, seed: int) -> Row:
-    tuned, largest = constant_backoff(plain)
-    return smallest_that_keeps(
-        lambda value: _judged(plain, name, run_charge(tuned, [value, value], seed), f"{1e3 * value:.1f} mV"), largest
-    )
+    backoffs = ConstantBackoffs(plain)
+
+    def run(values: Sequence[float]) -> Row:
+        return _judged(plain, name, run_charge(backoffs.problem, backoffs.theta(values), seed), backoffs.setting(values))
+
+    return smallest_that_keep(run, backoffs.limits, backoffs.largest, backoffs.tolerances)
 
 
-def constant_backoff(plain: ChargingProblem) -> tuple[ChargingProblem, float]:
-    """The problem with a voltage backoff of two nodes, and the largest value that still lets the cell charge."""
-    cell, highest = plain.cell, plain.voltage_max_V
-    room = highest - float(np.interp(plain.episode.soc_start, cell.ocv_soc, cell.ocv_V))
-    largest = min(BACKOFF_MAX_V, 0.9 * room)
-    return replace(plain, theta=Tunables(backoff=Backoff(nodes=2, lower_V=0.0, upper_V=largest))), largest
+@dataclass(frozen=True)
+class ConstantBackoffs:
+    """A constant backoff of each upper or anode limit that the controller keeps, of the problem without any other theta."""
+
+    plain: ChargingProblem
+
+    @cached_property
+    def limits(self) -> tuple[str, ...]:
+        """Their names: voltage_max_V, and where they are limits that the controller sees temperature_max_K and anode_min_V."""
+        kept = self.plain.limits_by_name
+        return tuple(name for name in ("voltage_max_V", "temperature_max_K", "anode_min_V") if name in kept and kept[name].kind != "scored")
+
+    @cached_property
+    def of(self) -> tuple[str, ...]:
+        """What each is of: voltage, temperature, anode."""
+        return tuple(self.plain.limits_by_name[name].of for name in self.limits)
+
+    @property
+    def tolerances(self) -> list[float]:
+        """To what each is found, in the unit of its limit."""
+        return [BACKOFFS[of][1] for of in self.of]
+
+    @property
+    def largest(self) -> list[float]:
+        """The largest of each; that of the voltage still lets the cell charge."""
+        plain = self.plain
+        room = plain.voltage_max_V - float(np.interp(plain.episode.soc_start, plain.cell.ocv_soc, plain.cell.ocv_V))
+        return [min(BACKOFFS[of][0], 0.9 * room) if of == "voltage" else BACKOFFS[of][0] for of in self.of]
+
+    @cached_property
+    def problem(self) -> ChargingProblem:
+        """The problem whose theta they are."""
+        most = dict(zip(self.of, self.largest, strict=True))
+
+        def margin(of: str) -> LimitBackoff | None:
+            return LimitBackoff(0.0, most[of]) if of in most else None
+
+        return replace(
+            self.plain,
+            theta=Tunables(
+                backoff=Backoff(nodes=2, lower_V=0.0, upper_V=most["voltage"]) if "voltage" in most else None,
+                temperature_backoff=margin("temperature"),
+                anode_backoff=margin("anode"),
+            ),
+        )
+
+    def theta(self, values: Sequence[float]) -> list[float]:
+        """theta of `problem` for one value of each; the voltage's has two nodes."""
+        return [value for of, value in zip(self.of, values, strict=True) for _ in range(2 if of == "voltage" else 1)]
+
+    def setting(self, values: Sequence[float]) -> str:
+        """The values with their units, for a table."""
+        texts = [f"{value:.2f} K" if of == "temperature" else f"{1e3 * value:.1f} mV" for of, value in zip(self.of, values, strict=True)]
+        return texts[0] if len(texts) == 1 else ", ".join(f"{of} {text}" for of, text in zip(self.of, texts, strict=True))
 
 
 class Verdict(Protocol):
@@ -196,6 +247,8 @@ class Verdict(Protocol):
 
     @property
     def breaks_limit(self) -> bool: ...
+
+    def breaks(self, limit: str) -> bool: ...
 
 
 T = TypeVar("T", bound=Verdict)
@@ -210,16 +263,26 @@ def largest_share(kept: Callable[[float], bool]) -> float:
     return low or high
 
 
-def smallest_that_keeps(run: Callable[[float], T], largest: float) -> T:
-    """The run at the smallest value in [0, largest] with which no limit is broken, by bisection; at the largest when none does it."""
-    low, high, best = 0.0, largest, run(largest)
-    if best.breaks_limit:
-        return best
-    none = run(0.0)
+def smallest_that_keep(
+    run: Callable[[Sequence[float]], T], limits: Sequence[str], largest: Sequence[float], tolerances: Sequence[float]
+) -> T:
+    """The run with the smallest backoff of each limit with which it is kept; with the largest of all where these do not keep every limit.
+
+    Each is the smallest in [0, largest] with which its own limit is kept, to its tolerance, by bisection, the others at 0: they only
+    make the charge more careful. Together they have to keep every limit.
+    """
+    none = run([0.0] * len(limits))
     if not none.breaks_limit:
         return none
-    while high - low > BACKOFF_TOLERANCE_V:
-        middle = (low + high) / 2
-        row = run(middle)
-        low, high, best = (middle, high, best) if row.breaks_limit else (low, middle, row)
-    return best
+    values = [0.0] * len(limits)
+    for i, (name, most, tolerance) in enumerate(zip(limits, largest, tolerances, strict=True)):
+        if not none.breaks(name):
+            continue
+        low, high = 0.0, most
+        while high - low > tolerance:
+            values[i] = (low + high) / 2
+            alone = [value if k == i else 0.0 for k, value in enumerate(values)]
+            low, high = (values[i], high) if run(alone).breaks(name) else (low, values[i])
+        values[i] = high
+    best = run(values)
+    return run(largest) if best.breaks_limit else best

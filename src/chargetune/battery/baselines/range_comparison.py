@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
-from chargetune.battery.baselines.comparison import CCCV, FEEDBACK, chosen_rows, constant_backoff, largest_share, smallest_that_keeps
+from chargetune.battery.baselines.comparison import (
+    CCCV,
+    FEEDBACK,
+    ConstantBackoffs,
+    chosen_rows,
+    largest_share,
+    smallest_that_keep,
+)
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.controller import controller_of
 from chargetune.battery.charging.limits import Limit
@@ -50,6 +57,10 @@ class RangeRow:
     def breaks_limit(self) -> bool:
         return self.violations > 0
 
+    def breaks(self, limit: str) -> bool:
+        """Whether this limit was broken on a plant, or a charge did not come to its end."""
+        return any(score is None or score.excess[limit] > score.tolerance[limit] for score in self.scores)
+
     def worst_excess(self, limit: str) -> float | None:
         """The largest excess of a limit over the plants."""
         return max((score.excess[limit] for score in self.scores if score is not None), default=None)
@@ -79,7 +90,7 @@ def compare_range(
 ) -> Iterator[RangeRow]:
     """Run every row of `range_row_names`, or the named ones, on the same plants of the range of use, in the order in which they are done.
 
-    CC-CV has the fastest rate, and the constant backoff the smallest value, with which every limit is kept on all of the plants; where
+    CC-CV has the fastest rate, and the constant backoffs the smallest values, with which every limit is kept on all of the plants; where
     none does, the most cautious one. CC-CV keeps the voltage exactly, the oracle every limit: it knows each plant. Controllers see the
     problem's sensors with noise; all are judged by the true outputs. Raises ValueError without a range, or for an unknown row.
     """
@@ -136,12 +147,12 @@ class _Drawn:
         return RangeRow(name, tuple(map(self._score, episodes)), setting)
 
     def _backoff(self, name: str, plain: ChargingProblem) -> RangeRow:
-        tuned, largest = constant_backoff(plain)
+        backoffs = ConstantBackoffs(plain)
 
-        def run(value: float) -> RangeRow:
-            return self._controlled(name, tuned, [value, value], f"{1e3 * value:.1f} mV")
+        def run(values: Sequence[float]) -> RangeRow:
+            return self._controlled(name, backoffs.problem, backoffs.theta(values), backoffs.setting(values))
 
-        return smallest_that_keeps(run, largest)
+        return smallest_that_keep(run, backoffs.limits, backoffs.largest, backoffs.tolerances)
 
     def _fastest(self, name: str) -> RangeRow:
         """CC-CV at the largest rate with which every limit is kept on all plants, by bisection."""
