@@ -82,7 +82,7 @@ def test_a_warning_is_no_failure_and_entries_are_printed_with_their_brackets(cha
     code, out, _ = chargetune_here("check", path)
     assert code == 0
     assert "current_limit[0]" in out
-    assert "0 errors, 1 warnings" in out
+    assert "0 errors, 1 warning" in out
 
 
 def test_a_theta_that_is_declared_safe_is_checked(chargetune_here, study):

@@ -16,6 +16,7 @@ from chargetune.battery.studies.study_file import load_config
 from chargetune.checks.finding import Finding
 from chargetune.cli.output import console, setting
 from chargetune.cli.outputs import Kind, Output, claim, read_by
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["check_command", "facts", "print_findings"]
@@ -83,7 +84,7 @@ def print_findings(findings: Sequence[Finding], screen: Console) -> None:
 def summary(findings: Sequence[Finding]) -> str:
     """How many of each."""
     errors = sum(f.severity == "error" for f in findings)
-    return f"{errors} errors, {len(findings) - errors} warnings" if findings else "nothing found"
+    return f"{counted(errors, 'error')}, {counted(len(findings) - errors, 'warning')}" if findings else "nothing found"
 
 
 def facts(finding: Finding) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from chargetune.cli.output import console, number, result_line, setting, shown, 
 from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
 from chargetune.study.result import StudyResult, read_result
@@ -58,7 +59,7 @@ def compare_command(
     if draws is not None:
         raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
     names = chosen_rows(row_names(problem, theta), rows)
-    workers = workers_for(workers, len(names), "controllers")
+    workers = workers_for(workers, len(names), ("controller", "controllers"))
     found: dict[str, Row] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -106,7 +107,7 @@ def _over_range(
     as_json: bool,
 ) -> None:
     names = chosen_rows(range_row_names(problem, theta), wanted)
-    workers = workers_for(workers, len(names), "controllers")
+    workers = workers_for(workers, len(names), ("controller", "controllers"))
     found: dict[str, RangeRow] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -134,9 +135,9 @@ def _over_range(
     screen.print(table)
     line = "" if problem.range is None else problem.range.line
     screen.print(
-        f"Range of use: {line}. The same {draws} drawn plants in every row, judged by their true outputs. CC-CV has the fastest rate, and "
-        "the constant backoff the smallest value, with which all of these plants keep every limit, or the most cautious one if none "
-        "does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
+        f"Range of use: {line}. The same {counted(draws, 'drawn plant')} in every row, judged by their true outputs. CC-CV has the "
+        "fastest rate, and the constant backoff the smallest value, with which all of these plants keep every limit, or the most "
+        "cautious one if none does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
         style="dim",
     )
     if result is not None:

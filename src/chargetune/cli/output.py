@@ -114,7 +114,7 @@ def plants_over(score: Score | None) -> str:
     return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
 
 
-def workers_for(wanted: int, work: int, what: str) -> int:
+def workers_for(wanted: int, work: int, what: tuple[str, str]) -> int:
     """The number of worker processes; where fewer than wanted can have something to do, one line on stderr says so."""
     count, said = bounded_workers(wanted, work, what)
     if said:

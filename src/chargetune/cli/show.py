@@ -45,7 +45,7 @@ def show_command(location: str, *, study: str | None, as_json: bool) -> None:
 def _list(views: list[StudyView]) -> None:
     table = Table(box=None, pad_edge=False)
     apart = ("apart",) if any(t.status is TrialStatus.APART for view in views for t in view.trials) else ()
-    for heading in ("study", "trials", "failed", *apart, "violating", "best trial", "its objective", "begun"):
+    for heading in ("study", "trials", "failed", *apart, "over", "best trial", "its objective", "begun"):
         table.add_column(heading, justify="left" if heading in ("study", "its objective", "begun") else "right")
     for view in views:
         s, best = _summary(view), view.result.kept

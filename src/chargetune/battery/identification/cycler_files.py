@@ -25,6 +25,7 @@ from chargetune.battery.identification.plausibility import checked
 from chargetune.battery.identification.record import Record
 from chargetune.battery.identification.samples import Samples, read_samples
 from chargetune.battery.validation import check_count
+from chargetune.runtime.counted import counted
 
 __all__ = ["Reading", "read_record"]
 
@@ -103,7 +104,7 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
     raw, of_day = _time(samples, columns[source], mark, assumed, remarks)
     current = arrays["current"]
     if len(current) < 2:
-        raise ValueError(f"{name} has {len(current)} rows of numbers, allowed are at least 2")
+        raise ValueError(f"{name} has {counted(len(current), 'row')} of numbers, allowed are at least 2")
     known = both
     if "state" in columns and options.sign is None and not both:
         signed = signed_by_state(name, current, samples.cells["state"], remarks)

@@ -8,6 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from chargetune.runtime.counted import counted
+
 __all__ = ["JUMP_SHARE", "Record", "segments"]
 
 # Below this share of the largest current a cell rests.
@@ -35,7 +37,9 @@ class Record:
             if (values := getattr(self, name)) is None:
                 continue
             if np.shape(values) != (len(self.time_s),) or not np.all(np.isfinite(values)):
-                raise ValueError(f"{self.source}: {name} of shape {np.shape(values)}, allowed are {len(self.time_s)} finite numbers")
+                raise ValueError(
+                    f"{self.source}: {name} of shape {np.shape(values)}, allowed: {counted(len(self.time_s), 'finite number')}"
+                )
         falls = np.diff(self.time_s) < 0
         if falls.any():
             k = int(np.argmax(falls))

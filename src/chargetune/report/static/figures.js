@@ -120,7 +120,7 @@ const Figures = (() => {
 
   const KINDS = [
     ["within limits", "ok", "circle", (row) => row.feasible === true],
-    ["violating", "limit", "triangle-up-open", (row) => row.feasible === false],
+    ["over a limit", "limit", "triangle-up-open", (row) => row.feasible === false],
   ];
   const unit = (text) => (text ? ` (${text})` : "");
   const decade = (values) => values.length > 0 && Math.min(...values) > 0 && Math.max(...values) > 10 * Math.min(...values);

@@ -173,7 +173,7 @@ function compare(shown) {
 
 function tell() {
   const list = [...rows.values()], count = (test) => list.filter(test).length;
-  where("counts").textContent = `${list.length} trials: ${count((row) => row.feasible === true)} within the limits, `
+  where("counts").textContent = `${counted(list.length, "trial")}: ${count((row) => row.feasible === true)} within the limits, `
     + `${count((row) => row.feasible === false)} beyond one, ${count((row) => row.status === "failed")} failed, `
     + (count((row) => row.status === "apart") ? `${count((row) => row.status === "apart")} set apart, ` : "")
     + `${count((row) => row.status === "running")} running.`;
@@ -187,7 +187,8 @@ const state = (text, kind) => {
 
 function about() {
   const why = result && (result.trial === null ? `no result: ${result.sentence}` : `the result is trial ${result.trial}: ${result.sentence}`);
-  const parts = [head.cell, head.tuner && `tuner ${head.tuner}`, `${head.theta.length} entries of theta`, head.remark, why];
+  const parts = [head.cell, head.tuner && `tuner ${head.tuner}`,
+    counted(head.theta.length, "entry of theta", "entries of theta"), head.remark, why];
   where("about").textContent = parts.filter(Boolean).join("; ");
 }
 source.addEventListener("study", (event) => {
