@@ -40,7 +40,7 @@ def test_the_options_decide_what_the_file_leaves_open(tmp_path, refused):
             chargetune("identify", CASES / "06_lfp_hysteresis.csv", "-o", out, "--overwrite", "--branch", "charge", "--json").stdout
         )["remarks"]
     )
-    assert "time_unit = 'week', allowed are s, ms, min" in refused("identify", unsigned, "-o", out, "--time-unit", "week")
+    assert "time_unit = 'week', allowed are s, ms, us, min, h, d, hh:mm" in refused("identify", unsigned, "-o", out, "--time-unit", "week")
     assert "allowed are those of its pulses, 0, 25 degC" in refused(
         "identify", CASES / "05_two_temperatures.csv", "-o", out, "--overwrite", "--temperature", 60
     )

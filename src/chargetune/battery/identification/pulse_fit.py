@@ -29,7 +29,7 @@ from chargetune.battery.identification.pulses import (
     set_temperatures,
     unused_pulses,
 )
-from chargetune.battery.identification.record import Record, segments
+from chargetune.battery.identification.record import Record, assumptions_told, segments
 from chargetune.battery.validation import check_number
 from chargetune.runtime.counted import counted
 
@@ -69,18 +69,29 @@ def identify(
     several temperatures ``temperature_C`` says which sets are used. A set whose fit the data do not hold is left out, and
     the remarks say so. Raises ValueError that says which parameter the data do not hold at any SOC, or the temperatures.
     """
-    began = time.perf_counter()
     if rc not in {1, 2}:
         raise ValueError(f"rc = {rc!r}, allowed is 1 or 2")
     if branch not in {"charge", "discharge", "middle"}:
         raise ValueError(f"branch = {branch!r}, allowed are charge, discharge and middle")
+    with assumptions_told(record):
+        return _identified(record, rc, capacity_Ah, ocv, name, temperature_C, branch)
+
+
+def _identified(
+    record: Record,
+    rc: Literal[1, 2],
+    capacity_Ah: float | None,
+    ocv: Record | None,
+    name: str,
+    temperature_C: float | None,
+    branch: Branch,
+) -> Identification:
+    began = time.perf_counter()
     every = find_pulse_sets(record)
     if len(every) < SETS_MIN:
-        assumed = [f"; {remark}" for remark in record.remarks if "time-unit" in remark]
         raise ValueError(
             f"{record.source}: {counted(len(every), 'set')} of pulses after a rest; to identify R0, R1 and C1 over SOC "
-            f"at least {SETS_MIN} are needed (pulses of at most {PULSE_MAX_S:g} s after rests of at "
-            f"least {REST_MIN_S:g} s){''.join(assumed)}"
+            f"at least {SETS_MIN} are needed (pulses of at most {PULSE_MAX_S:g} s after rests of at least {REST_MIN_S:g} s)"
         )
     remarks = [*record.remarks, "SOC 1 is the fullest point of the record"]
     chosen, within = _at_temperature(record, every, temperature_C, remarks)
@@ -104,9 +115,11 @@ def identify(
     remarks += unused_pulses(record, every, soc)
     sets = [every[k] for k in chosen]
     within[:start] = False
-    grid, volts = (
-        ocv_from_rests(record, sets, soc, remarks, branch, within) if ocv is None else ocv_from_slow(ocv, capacity, remarks, branch)
-    )
+    if ocv is None:
+        grid, volts = ocv_from_rests(record, sets, soc, remarks, branch, within)
+    else:
+        with assumptions_told(ocv):
+            grid, volts = ocv_from_slow(ocv, capacity, remarks, branch)
     curve = PchipInterpolator(grid, volts, extrapolate=True)
     fits, unfit = list[PulseFit](), list[ValueError]()
     for k in chosen:

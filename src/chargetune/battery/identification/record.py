@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.runtime.counted import counted
 
-__all__ = ["JUMP_SHARE", "Record", "segments"]
+__all__ = ["JUMP_SHARE", "Record", "assumptions_told", "segments"]
 
 # Below this share of the largest current a cell rests.
 REST_SHARE = 0.02
@@ -65,6 +67,18 @@ class Record:
         """Samples ``first`` .. ``last`` (last not included)."""
         warm = None if self.temperature_K is None else self.temperature_K[first:last]
         return Record(self.source, self.time_s[first:last], self.current_A[first:last], self.voltage_V[first:last], warm, self.remarks)
+
+
+@contextmanager
+def assumptions_told(record: Record) -> Iterator[None]:
+    """Within it, what is refused of the record is followed by what was assumed where an option decides: its cause may be there."""
+    try:
+        yield
+    except ValueError as error:
+        assumed = [remark for remark in record.remarks if remark.endswith("decides)")]
+        if type(error) is not ValueError or not assumed or str(error).endswith("decides)"):
+            raise
+        raise ValueError("; ".join([str(error), *assumed])) from error
 
 
 def segments(record: Record) -> list[tuple[int, int, int]]:
