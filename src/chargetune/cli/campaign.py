@@ -34,7 +34,7 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
     read = {e.source: read_by(e.folder / Path(e.source).name, e.config.model_dump()) for e in entries}
     if "://" not in kept:
         inputs = [path, *(file for files in read.values() for file in files)]
-        claim([Output("store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
+        claim([Output("--store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
     _check(entries, force=force)
     with Store(kept) as opened:
         found = standings(opened, entries)

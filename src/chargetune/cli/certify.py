@@ -76,8 +76,7 @@ def certify_command(
     target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
-    what = "certificate" if output is None else "--output"
-    outputs = [Output(what, target, Kind.CERTIFICATE), Output(f"{what}'s figure", target.with_suffix(".png"), Kind.PNG)]
+    outputs = [Output("--output", target, Kind.CERTIFICATE), Output("--output's figure", target.with_suffix(".png"), Kind.PNG)]
     claim(outputs, inputs=[location], overwrite=overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     charges: list[Charge] = []

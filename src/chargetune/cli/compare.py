@@ -41,7 +41,7 @@ def compare_command(
 ) -> None:
     """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     config = load_config(path)
     if figure is not None:
         read: list[str | Path] = [*read_by(path, config.model_dump()), *([] if store is None else [store])]

@@ -61,7 +61,7 @@ def identify_command(
 ) -> None:
     """Fit a cell to measured pulses, at each temperature where there are several, write it, and say how well it fits."""
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     reading = Reading(cast("Sign | None", sign), *units, series=series, parallel=parallel)
     read = [data, *([] if ocv is None else [ocv]), *check]
     record = read_record(data, reading)

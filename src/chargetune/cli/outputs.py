@@ -57,7 +57,8 @@ FIGURES = {".png": Kind.PNG, ".pdf": Kind.PDF, ".svg": Kind.SVG}
 class Output:
     """A file that a command is going to write.
 
-    ``what`` is how a message begins: the option, or what the file is. ``renewed``: it is this command's own from an earlier run,
+    ``what`` is how a message begins: the option that names the file, also where it has its default, so that one knows how to choose
+    another. ``renewed``: it is this command's own from an earlier run,
     which the same command continues.
     """
 
@@ -193,4 +194,7 @@ def _can(output: Output, *, folders: bool) -> None:
     place = path.resolve()
     if not place.parent.exists() and not folders:
         raise ValueError(f"{output.what} {path}: there is no folder {path.parent}")
-    try_whole(place)
+    try:
+        try_whole(place)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, f"{output.what} {path}") from error

@@ -38,7 +38,7 @@ def report_command(
             )
         study = names[0]
     target = out or beside(location, ".html")
-    page = Output("page" if out is None else "--output", target, Kind.PAGE)
+    page = Output("--output", target, Kind.PAGE)
     claim([page], inputs=[location], overwrite=overwrite, folders=False)
     view = read_study(location, study)
     vectors = [] if figures is None else [Output("--figures", figures / f"{stem}.pdf", Kind.PDF) for stem in figure_names(view)]

@@ -48,7 +48,7 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     own = overwrite or _is_claims(tables[0])
     claim(
         [
-            Output("store", path, Kind.STORE, renewed=True),
+            Output("--out", path, Kind.STORE, renewed=True),
             *(Output("--out", table, Kind.JSON, renewed=own) for table in tables),
             Output("--out", out / f"{case}-{tuner}-seeds.png", Kind.PNG, renewed=own),
             *(Output("--out", drawn / f"{stem}.png", Kind.PNG, renewed=own) for stem in ("trajectories", "backoff", "R1", "convergence")),

@@ -33,7 +33,7 @@ def simulate_command(
     ``figure`` is drawn as its ending says (png, pdf, svg); ``out`` has the trace as CSV, one row an interval.
     """
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     if out is not None and out.suffix.lower() != ".csv":
         raise ValueError(f"--out {out}: allowed is a file that ends with .csv")
     config = load_config(path)

@@ -79,7 +79,7 @@ def tune_command(
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
-    outputs = [] if "://" in kept else [Output("store", Path(kept), Kind.STORE, renewed=True)]
+    outputs = [] if "://" in kept else [Output("--store", Path(kept), Kind.STORE, renewed=True)]
     if out is not None:
         outputs += _files(out, config, problem, kept)
     claim(outputs, inputs=read_by(path, config.model_dump()), overwrite=overwrite)
