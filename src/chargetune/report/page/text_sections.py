@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
-from chargetune.battery.charging.wording import metric_words
 from chargetune.episode.score import Score
 from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
@@ -15,7 +14,7 @@ from chargetune.report.page.html import Cell, beside, paragraph, section, table
 from chargetune.report.page.trial_rows import study_head
 from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
 from chargetune.report.study_view import StudyView
-from chargetune.report.words import limits_of_study, objective_of_study
+from chargetune.report.words import limits_of_study, metrics_of_study, objective_of_study
 from chargetune.runtime.counted import counted
 from chargetune.study.store.database import store_name
 from chargetune.study.trial import Trial, TrialStatus
@@ -137,11 +136,11 @@ def result(view: StudyView, feedback: Score | None = None) -> str:
         rows.append((x["entry"], value, x["untuned"], x["unit"], x["lower"], x["upper"], at))
     headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower", "upper", "")
     scores = [start.score if start is not None else None, *([feedback] if feedback is not None else []), best.score]
-    names = dict.fromkeys(name for score in scores if score is not None for name in score.metrics)
     figures: list[tuple[Cell, ...]] = []
-    for name in names:
-        label, unit = metric_words(name)
-        figures.append((label, *(None if score is None else score.metrics.get(name) for score in scores), (unit, "text")))
+    for name, words in metrics_of_study(view).items():
+        values = [None if score is None else score.metrics.get(name) for score in scores]
+        if any(value is not None for value in values):
+            figures.append((words.label, *(None if v is None else words.factor * v for v in values), (words.unit, "text")))
     what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
     other = ["untuned, offset_free"] if feedback is not None else []
     merit = table(("figure of merit", view.start_label, *other, f"trial {best.number}", ("unit", "text")), figures)
@@ -270,7 +269,7 @@ def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
             ("its seed", str(best.seed)),
             ("its trace (SHA-256)", best.trace_sha256),
         ]
-        rows += [(f"made with {name}", str(v)) for name, v in best.provenance.get("versions", {}).items()]
+        rows.append(("made with", ", ".join(f"{name} {version}" for name, version in best.provenance.get("versions", {}).items())))
         if reproduced and view.problem is not None:
             off = again(view, best)
             rows.append(("evaluated again now, largest difference", "no score" if off is None else f"{off:.1e}"))

@@ -164,7 +164,10 @@ function compare(shown) {
   add("limits", both.map((row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken")));
   add(head.objective.label, both.map((row) => row.value));
   for (const { name, label, unit } of head.excesses) add(named(label, unit), both.map((row) => row.excesses[name] ?? null));
-  for (const [name, [label, unit]] of Object.entries(head.metrics)) add(named(label, unit), both.map((row) => row.metrics[name] ?? null));
+  for (const [name, [label, unit]] of Object.entries(head.metrics)) {
+    const values = both.map((row) => row.metrics[name] ?? null);
+    if (values.some((value) => value !== null)) add(named(label, unit), values);
+  }
   for (const { entry, unit } of head.theta) add(named(entry, unit), picked.map(({ drawing: found }) => found.theta[entry]));
   where("compared-rows").replaceChildren(...body);
 }
