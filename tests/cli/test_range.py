@@ -57,6 +57,8 @@ def test_a_trial_is_a_theta_on_the_drawn_plants(folder, trials):
 def test_show_says_on_how_many_plants_a_limit_was_broken(folder, trials):
     text = chargetune("show", folder / "use.sqlite", "--study", "use").stdout
     assert "plants" in text
+    assert "…" not in text
+    assert re.findall(r"_V\[\d\]", text) == ["_V[0]", "_V[1]"]
     for trial in trials:
         assert count(trial) in re.sub(r"\s+", " ", text)
 

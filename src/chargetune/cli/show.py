@@ -83,8 +83,9 @@ def _show_trials(view: StudyView) -> None:
     table.add_column("trial", justify="right", no_wrap=True)
     for heading in ("", "status"):
         table.add_column(heading)
-    for heading in (*columns, *(["plants\nover"] if drawn else []), *map(escape, entries)):
-        table.add_column(heading, justify="right", vertical="bottom")
+    for heading in (*columns, *(["plants\nover"] if drawn else []), *(escape(e.replace("_", "\n_", 1)) for e in entries)):
+        # At 80 columns a name may need several lines; the end of it, its number, is never cut.
+        table.add_column(heading, justify="right", vertical="bottom", overflow="fold")
     table.add_column("limits")
     for t in trials:
         s = t.score
