@@ -56,8 +56,8 @@ def test_check_says_that_a_measured_voltage_is_not_read(chargetune_here, tmp_pat
 
 def test_check_tells_that_there_is_nothing_to_tune(chargetune_here):
     code, out, _ = chargetune_here("check", EXAMPLES / "reference_model.toml")
-    assert code == 0
-    assert "warning no-theta: theta is empty" in out
+    assert code == 1
+    assert "error no-theta: theta is empty" in out
     assert "add a table [theta.backoff]" in out
 
 

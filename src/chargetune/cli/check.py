@@ -22,10 +22,10 @@ from chargetune.runtime.interrupts import raise_lost_interrupt
 __all__ = ["check_command", "facts", "print_findings"]
 
 
-# A controller without theta can be simulated and compared, and not tuned.
+# A controller without theta can be simulated and compared, and not tuned, which is what a check is for.
 NO_THETA = Finding(
     "no-theta",
-    "warning",
+    "error",
     "theta is empty: there is nothing to tune, and tune refuses it",
     "add a table [theta.backoff], [theta.R0] or [theta.R1]",
     {},
