@@ -181,10 +181,16 @@ def _may(output: Output, *, overwrite: bool) -> None:
     found = kind_of(path)
     if found not in (output.kind, Kind.EMPTY):
         raise ValueError(
-            f"{output.what} {path}: there is a {found} of this name, which a {output.kind} does not replace; choose another name"
+            f"{output.what} {path}: there is {_article(found)} of this name, which {_article(output.kind)} does not replace; "
+            "choose another name"
         )
     if not overwrite and not output.renewed:
         raise ValueError(f"{output.what} {path}: exists; --overwrite replaces it")
+
+
+def _article(kind: Kind) -> str:
+    """The kind with its article: an HTML page, a cell file."""
+    return f"{'an' if kind in (Kind.PAGE, Kind.SVG, Kind.EMPTY) else 'a'} {kind}"
 
 
 def _can(output: Output, *, folders: bool) -> None:
