@@ -12,7 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from chargetune.battery.charging.checks import check_charging
-from chargetune.battery.studies.study_file import load_config
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.checks.finding import Finding
 from chargetune.cli.output import console, setting
 from chargetune.cli.outputs import Kind, Output, claim, read_by
@@ -49,6 +50,8 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
     else:
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
+    if not any(finding.severity == "error" for finding in findings):
+        findings = (*_first_trial(config, problem), *findings)
     raise_lost_interrupt()
     if not problem.space.dimension:
         findings = (NO_THETA, *findings)
@@ -69,6 +72,21 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
         screen.print(f"{path}: {summary(findings)}" + "".join(f"\nfigure {f}" for f in drawn), markup=False, soft_wrap=True)
     if any(f.severity == "error" for f in findings):
         sys.exit(1)
+
+
+def _first_trial(config: Config, problem: ChargingProblem) -> tuple[Finding, ...]:
+    """Whether safe mode has a theta to begin with. Over a range of use that takes minutes, and is left to the study."""
+    if problem.safety is None or problem.safe_start is not None or problem.range is not None or not problem.space.dimension:
+        return ()
+    from chargetune.battery.studies.open_study import make_tuner
+    from chargetune.learning import NoSafeThetaError
+
+    try:
+        make_tuner(config.study.tuner, config.study.seed, problem, config.twin).ask(problem.space, [])
+    except NoSafeThetaError as error:
+        remedy = "a start that is known to keep them ([safety] start), wider bounds of theta, or a smaller spread in [twin]"
+        return (Finding("no-safe-start", "error", str(error), remedy, {}),)
+    return ()
 
 
 def print_findings(findings: Sequence[Finding], screen: Console) -> None:
