@@ -76,3 +76,19 @@ def test_what_tables_say_of_each_other_names_file_and_table(text, said, refused,
     path.write_text(text + "[theta.backoff]\nnodes = 2\n")
     for command in (["check", path], ["tune", path, "--store", tmp_path / "s.sqlite"], ["simulate", path]):
         assert refused(*command).startswith(f"chargetune: {path}: {said}")
+
+
+def test_what_a_table_names_is_told_with_the_file_and_its_key(refused, tmp_path):
+    path, theta = tmp_path / "k.toml", "[theta.backoff]\nnodes = 2\n"
+
+    def said(text, *command):
+        path.write_text(text + theta)
+        return refused(*(command or ("check", path)))
+
+    for table, key in (('[cell]\nfile = "none.toml"\n', "cell.file"), ('[plant]\ncell = "none.toml"\n', "plant.cell")):
+        assert said(table).startswith(f"chargetune: {path}: {key} = {tmp_path / 'none.toml'}: No such file")
+    safety = f"chargetune: {path}: [safety] is given with tuner = 'default', allowed is tuner = 'twin'"
+    assert said("[safety]\n").startswith(safety)
+    assert said("[safety]\n", "tune", path, "--store", tmp_path / "s.sqlite").startswith(safety)
+    assert "(did you mean 'Chen2020'?)" in said('[plant]\nmodel = "SPM"\nparameters = "chen2020"\n')
+    assert "--theta has 3 values, allowed is one for each of these 2: backoff_V[0]," in said("", "simulate", path, "--theta", "1,2,3")

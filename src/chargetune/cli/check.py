@@ -82,7 +82,9 @@ def _first_trial(config: Config, problem: ChargingProblem) -> tuple[Finding, ...
     from chargetune.learning import NoSafeThetaError
 
     try:
-        make_tuner(config.study.tuner, config.study.seed, problem, config.twin).ask(problem.space, [])
+        with config.named():
+            tuner = make_tuner(config.study.tuner, config.study.seed, problem, config.twin)
+        tuner.ask(problem.space, [])
     except NoSafeThetaError as error:
         remedy = "a start that is known to keep them ([safety] start), wider bounds of theta, or a smaller spread in [twin]"
         return (Finding("no-safe-start", "error", str(error), remedy, {}),)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -40,6 +42,23 @@ class Check(NamedTuple):
     remarks: tuple[str, ...]
 
 
+# The options that a refusal calls by the names of the Python interface.
+OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("time_unit", "current_unit", "capacity_Ah")} | {
+    "temperature_C": "--temperature"
+}
+
+
+@contextmanager
+def _options_named() -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        if type(error) is not ValueError:
+            raise
+        raise ValueError(re.sub(rf"\b({'|'.join(OPTIONS)}) = ", lambda found: f"{OPTIONS[found[1]]} = ", str(error))) from error
+
+
+@_options_named()
 def identify_command(
     data: Path,
     *,

@@ -108,4 +108,8 @@ def parse_theta(text: str, problem: ChargingProblem, option: str) -> NDArray[np.
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise ValueError(f"{option} = {text!r}: expected numbers separated by commas, or a JSON object of named values") from error
-    return problem.space.validate(numbers)
+    space = problem.space
+    if len(numbers) != space.dimension:
+        named = ", ".join(space.entries)
+        raise ValueError(f"{option} has {counted(len(numbers), 'value')}, allowed is one for each of these {space.dimension}: {named}")
+    return space.validate(numbers)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -166,11 +167,10 @@ class Config(_Table):
 
         Raises ValueError, FileNotFoundError.
         """
-        cell, plant = cell or self._cell(folder), plant or self._plant(folder)
-        try:
+        with self.named():
             return ChargingProblem(
-                cell=cell,
-                plant=plant,
+                cell=cell or self._cell(folder),
+                plant=plant or self._plant(folder),
                 controller=self.controller,
                 estimator=self.estimator,
                 limits=self.limits,
@@ -181,9 +181,21 @@ class Config(_Table):
                 safety=self.safety,
                 range=self.range,
             )
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Within it, what is refused names the file: what tables say of each other is told as what one says of itself is."""
+        try:
+            yield
+        except FileNotFoundError as error:
+            for key, file in (("cell.file", self.cell.file), ("plant.cell", getattr(self.plant, "cell", None))):
+                if file and error.filename and Path(error.filename).name == Path(file).name:
+                    raise FileNotFoundError(error.errno, error.strerror, f"{self._file}: {key} = {error.filename}".lstrip(": ")) from None
+            raise
         except ValueError as error:
-            # What tables say of each other is told as what one says of itself is: with the file.
-            raise ValueError(f"{self._file}: {error}" if self._file else str(error)) from None
+            if not self._file or type(error) is not ValueError:
+                raise
+            raise ValueError(f"{self._file}: {error}") from None
 
     def earlier(self, folder: Path | None = None) -> list[Earlier]:
         """The earlier studies; a relative file is looked for in ``folder``."""
