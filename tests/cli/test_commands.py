@@ -72,7 +72,7 @@ def test_simulate_takes_theta_by_name_and_by_position(tmp_path):
 @pytest.mark.parametrize(
     ("theta", "words"),
     [
-        ("0.1,0.1", ["shape (2,)", "(3,)", "backoff_V[0]"]),
+        ("0.1,0.1", ["--theta has 2 values", "these 3", "backoff_V[2]"]),
         ("0.1,0.1,0.3", ["backoff_V[2] = 0.3", "[0, 0.2] V"]),
         ("a,b", ["--theta", "numbers"]),
         ('{"backof": 1}', ["backof", "backoff_V"]),

@@ -82,8 +82,8 @@ def compare_command(
     screen = console()
     screen.print(_table(done))
     screen.print(
-        "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), least anode potential, "
-        "highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
+        "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), and where there are some the least anode "
+        "potential and the highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
         "and is what can be reached. Chosen is what was set on this very plant: CC-CV's fastest rate and the smallest "
         "constant backoff with which every limit is kept.[/]"
     )
@@ -196,20 +196,18 @@ def _extreme(row: Row, signal: str, *, largest: bool, factor: float) -> float | 
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for heading in ("", "chosen", "t80\nmin", "t90\nmin", "over\nmV", "anode\nmV", "max\nK", "limits"):
+    """A column for what some row has: a study without anode or temperature has none for them."""
+    table, facts = Table(box=None, pad_edge=False), [_facts(row) for row in rows]
+    columns = {
+        "t80\nmin": [number(one["t80_min"]) for one in facts],
+        "t90\nmin": [number(one["t90_min"]) for one in facts],
+        "over\nmV": [number(one["worst_excess"]["voltage_mV"], 1) for one in facts],
+        "anode\nmV": [number(one["anode_potential_min_mV"], 1) for one in facts],
+        "max\nK": [number(one["temperature_max_K"], 1) for one in facts],
+    }
+    told = {heading: values for heading, values in columns.items() if {*values} != {"-"}}
+    for heading in ("", "chosen", *told, "limits"):
         table.add_column(heading, justify="left" if heading in ("", "chosen", "limits") else "right", no_wrap=heading != "")
-    for row in rows:
-        facts = _facts(row)
-        excess = facts["worst_excess"]
-        table.add_row(
-            row.name,
-            row.setting,
-            number(facts["t80_min"]),
-            number(facts["t90_min"]),
-            number(excess["voltage_mV"], 1),
-            number(facts["anode_potential_min_mV"], 1),
-            number(facts["temperature_max_K"], 1),
-            "[red]broken[/]" if row.breaks_limit else "kept",
-        )
+    for row, *values in zip(rows, *told.values(), strict=True):
+        table.add_row(row.name, row.setting, *values, "[red]broken[/]" if row.breaks_limit else "kept")
     return table

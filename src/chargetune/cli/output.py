@@ -56,7 +56,8 @@ def shown(location: str) -> str:
 
 def number(value: float | None, digits: int = 2) -> str:
     """A figure, or a dash where the episode never got there."""
-    return "-" if value is None else f"{value:.{digits}f}"
+    # Adding zero to a negative one that is rounded takes its sign.
+    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def result_line(result: StudyResult) -> str:
