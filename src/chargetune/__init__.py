@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from chargetune.control.kalman import ExtendedKalman
     from chargetune.episode.compiled import simulate
     from chargetune.episode.episode import Ending, Episode, Trip
+    from chargetune.episode.recorded import recorded_episode
     from chargetune.episode.score import Score
     from chargetune.episode.score_limits import Evaluation, ScoredLimit, Windows, score_limits
     from chargetune.episode.stepwise import run_episode
@@ -108,6 +109,7 @@ __all__ = [
     "identify",
     "load_config",
     "open_study",
+    "recorded_episode",
     "rk4",
     "run_episode",
     "score_limits",
@@ -173,6 +175,7 @@ _MODULES = {
     "load_config": "battery.studies.study_file",
     "open_study": "battery.studies.open_study",
     "rk4": "model.integrators",
+    "recorded_episode": "episode.recorded",
     "run_episode": "episode.stepwise",
     "score_limits": "episode.score_limits",
     "simulate": "episode.compiled",

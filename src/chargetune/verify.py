@@ -110,7 +110,7 @@ def _figures(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> d
         for end in ("start", "end"):
             values = sign * (arrays[f"{end}.{limit['signal']}"] - float(limit["bound"]))
             if len(values) != edges[-1]:
-                raise ValueError(f"traces: {end}.{limit['signal']} has {len(values)} samples, expected {edges[-1]}")
+                raise ValueError(f"traces: {end}.{limit['signal']} has length {len(values)}, expected {edges[-1]}")
             for i in range(n):
                 if length[i]:
                     beyond[i] = max(beyond[i], float(values[edges[i] : edges[i + 1]].max()))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from commands import chargetune
 
+from chargetune.battery.identification.layouts import CLOCKS, SHORT_UNITS
 from study_text import study_text
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +72,7 @@ def test_simulate_takes_theta_by_name_and_by_position(tmp_path):
 @pytest.mark.parametrize(
     ("theta", "words"),
     [
-        ("0.1,0.1", ["shape (2,)", "(3,)", "backoff_V[0]"]),
+        ("0.1,0.1", ["--theta has 2 values", "these 3", "backoff_V[2]"]),
         ("0.1,0.1,0.3", ["backoff_V[2] = 0.3", "[0, 0.2] V"]),
         ("a,b", ["--theta", "numbers"]),
         ('{"backof": 1}', ["backof", "backoff_V"]),
@@ -207,6 +208,12 @@ def test_reproduce_of_a_learnt_stage_cost(tmp_path):
 @pytest.mark.parametrize("seeds", ["3:3", "a:b", "-1:2", "1,1"])
 def test_bad_seeds_are_refused(seeds, tmp_path, refused):
     assert "--seeds" in refused("reproduce", "model", f"--seeds={seeds}", "--out", tmp_path / "o")
+
+
+def test_help_lists_every_unit_that_is_accepted():
+    said = " ".join(chargetune("identify", "--help").stdout.split())
+    assert f"--time-unit <str> {', '.join((*SHORT_UNITS['time'], *CLOCKS))}." in said
+    assert f"--current-unit <str> {', '.join(SHORT_UNITS['current'])}." in said
 
 
 def test_help_is_light():

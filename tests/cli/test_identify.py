@@ -40,10 +40,19 @@ def test_the_options_decide_what_the_file_leaves_open(tmp_path, refused):
             chargetune("identify", CASES / "06_lfp_hysteresis.csv", "-o", out, "--overwrite", "--branch", "charge", "--json").stdout
         )["remarks"]
     )
-    assert "time_unit = 'week', allowed are s, ms, min" in refused("identify", unsigned, "-o", out, "--time-unit", "week")
+    assert "--time-unit = 'week', allowed are s, ms, us, min, h, d, hh:mm" in refused(
+        "identify", unsigned, "-o", out, "--time-unit", "week"
+    )
     assert "allowed are those of its pulses, 0, 25 degC" in refused(
         "identify", CASES / "05_two_temperatures.csv", "-o", out, "--overwrite", "--temperature", 60
     )
+
+
+def test_a_refusal_names_the_option(tmp_path, refused):
+    file, out = CASES / "16_underscore_units.csv", ["-o", tmp_path / "cell.toml"]
+    assert "--temperature = 25, but there is no column" in refused("identify", file, *out, "--temperature", 25)
+    assert "--capacity-Ah = 1, allowed is at least" in refused("identify", file, *out, "--capacity-Ah", 1)
+    assert "--current-unit = 'V', allowed are A" in refused("identify", file, *out, "--current-unit", "V")
 
 
 def test_what_was_left_out_is_in_the_summary_and_in_the_cell_file(tmp_path):

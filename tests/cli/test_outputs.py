@@ -19,6 +19,7 @@ from report_studies import charging, run_charging
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 EXAMPLES = Path(__file__).parents[2] / "examples"
+PULSES = Path(__file__).parents[1] / "battery" / "identification" / "cases" / "16_underscore_units.csv"
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,9 @@ def folder(tmp_path, studied):
     (tmp_path / "charge.sqlite").write_bytes(studied)
     (tmp_path / "cell.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
     (tmp_path / "study.toml").write_text(study_text(study={"trials": 1}, cell={"file": "cell.toml"}))
-    (tmp_path / "pulses.csv").write_text("time,current,voltage\n0,0,3.5\n1,0,3.5\n")
+    (tmp_path / "pulses.csv").write_bytes(PULSES.read_bytes())
+    (tmp_path / "many.toml").write_text('[campaign]\nconfigs = ["study.toml"]\nseeds = [0]\n')
+    (tmp_path / "slow.csv").write_bytes(PULSES.read_bytes())
     (tmp_path / "link.html").symlink_to("charge.sqlite")
     (tmp_path / "hard.html").hardlink_to(tmp_path / "charge.sqlite")
     return tmp_path
@@ -43,37 +46,45 @@ def contents(folder):
 
 
 @pytest.mark.parametrize(
-    "command",
+    ("command", "option"),
     [
-        "report charge.sqlite --no-evaluate -o charge.sqlite",
-        "report charge.sqlite --no-evaluate -o link.html --overwrite",
-        "report charge.sqlite --no-evaluate -o hard.html --overwrite",
-        "report charge.sqlite --no-evaluate -o charge.sqlite-wal",
-        "report charge.sqlite --no-evaluate -o study.toml --overwrite",
-        "report charge.sqlite --no-evaluate -o absent/page.html",
-        "report charge.sqlite --no-evaluate -o study.toml/page.html",
-        "identify pulses.csv -o pulses.csv --overwrite",
-        "identify pulses.csv -o cell.toml",
-        "identify pulses.csv -o study.toml --overwrite",
-        "identify pulses.csv -o new.toml --figure pulses.csv.png/x.png --check study.toml",
-        "identify pulses.csv -o new.toml --ocv new.toml",
-        "certify charge.sqlite --episodes 1000000000 -o study.toml/c.json",
-        "compare study.toml --figure charge.sqlite --overwrite",
-        "compare study.toml --figure cell.png/x.png",
-        "tune study.toml --store cell.toml",
-        "tune study.toml --store study.toml",
-        "tune study.toml --store s.sqlite --out study.toml",
-        "campaign study.toml --store study.toml",
-        "init cell.toml --cell cell.toml --overwrite",
-        "init charge.sqlite --overwrite",
-        "store salvage charge.sqlite hard.html",
-        "store export charge.sqlite --out study.toml",
+        ("report charge.sqlite --no-evaluate -o charge.sqlite", "--output"),
+        ("report charge.sqlite --no-evaluate -o link.html --overwrite", "--output"),
+        ("report charge.sqlite --no-evaluate -o hard.html --overwrite", "--output"),
+        ("report charge.sqlite --no-evaluate -o charge.sqlite-wal", "--output"),
+        ("report charge.sqlite --no-evaluate -o study.toml --overwrite", "--output"),
+        ("report charge.sqlite --no-evaluate -o absent/page.html", "--output"),
+        ("report charge.sqlite --no-evaluate -o study.toml/page.html", "--output"),
+        ("identify pulses.csv -o pulses.csv --overwrite", "--output"),
+        ("identify pulses.csv -o cell.toml", "--output"),
+        ("identify pulses.csv -o study.toml --overwrite", "--output"),
+        ("identify pulses.csv -o new.toml --figure pulses.csv/x.png", "--figure"),
+        ("identify pulses.csv -o slow.csv --ocv slow.csv", "--output"),
+        ("certify charge.sqlite --trial 0 --episodes 1000000000 -o study.toml/c.json", "--output"),
+        ("compare study.toml --figure charge.sqlite --overwrite", "--figure"),
+        ("compare study.toml --figure cell.png/x.png", "--figure"),
+        ("tune study.toml --store cell.toml", "--store"),
+        ("tune study.toml --store study.toml", "--store"),
+        ("tune study.toml --store s.sqlite --out study.toml", "--out"),
+        ("campaign many.toml --store study.toml", "--store"),
+        ("init cell.toml --cell cell.toml --overwrite", "study file"),
+        ("init charge.sqlite --overwrite", "study file"),
+        ("store salvage charge.sqlite hard.html", "NEW"),
+        ("store export charge.sqlite --out study.toml", "--out"),
+        ("report charge.sqlite --no-evaluate --figures study.toml", "--figures"),
+        ("simulate study.toml --figure cell.toml --overwrite", "--figure"),
+        ("simulate study.toml --figure x.jpg", "--figure"),
+        ("simulate study.toml --out study.toml", "--out"),
+        ("check study.toml --figures study.toml", "--figures"),
+        ("reproduce model --seeds 0:1 --out study.toml", "--out"),
+        ("compare study.toml --figure x.jpg", "--figure"),
+        ("identify pulses.csv -o new.toml --figure x.jpg", "--figure"),
     ],
 )
-def test_what_is_refused_changes_no_file(folder, command):
+def test_what_is_refused_changes_no_file_and_names_the_option(folder, command, option):
     before = contents(folder)
     said = chargetune(*command.split(), cwd=folder, code=2).stderr
-    assert said.startswith("chargetune: ")
+    assert said.startswith(f"chargetune: {option} ")
     assert contents(folder) == before
 
 

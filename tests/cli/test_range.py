@@ -57,6 +57,8 @@ def test_a_trial_is_a_theta_on_the_drawn_plants(folder, trials):
 def test_show_says_on_how_many_plants_a_limit_was_broken(folder, trials):
     text = chargetune("show", folder / "use.sqlite", "--study", "use").stdout
     assert "plants" in text
+    assert "…" not in text
+    assert re.findall(r"_V\[\d\]", text) == ["_V[0]", "_V[1]"]
     for trial in trials:
         assert count(trial) in re.sub(r"\s+", " ", text)
 
@@ -71,6 +73,14 @@ def test_the_report_speaks_of_the_range_and_evaluates_what_a_trial_is(folder, tr
     assert f"({count(result)} drawn plants over a limit)" in text
     assert "each trace is that of one drawn plant" in text
     assert "every stored excess is what its trace says" not in text
+    # What no charge reached has no row, and the worst plant's objective is told as the mean of all of them is.
+    merit = page.read_text().partition("figure of merit")[2].partition("</table>")[0]
+    assert "time to 99 % SOC" not in merit
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in merit.split("</tr>")[1:-1]]
+    assert rows
+    assert all({*row[1:-1]} != {"-"} for row in rows)
+    worst = next(row for row in rows if row[0] == "mean (z_d - z)^2, worst plant")
+    assert float(worst[1]) == pytest.approx(-trials[0]["metrics"]["objective_worst"], rel=1e-4)
     # On drawn plants an evaluation takes seconds: entries are put back, not moved.
     assert "Finite differences" not in text
     assert "untuned, offset_free" in text

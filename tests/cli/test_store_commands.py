@@ -60,7 +60,7 @@ def damaged(store):
 def test_check(store, run):
     code, out, _ = run("store", "check", store)
     assert code == 0
-    assert "1 studies, 4 trials, 4 traces are whole; nothing wrong" in out
+    assert "1 study, 4 trials, 4 traces are whole; nothing wrong" in out
     code, out, _ = run("store", "check", store, "--json")
     assert code == 0
     assert json.loads(out) == {"store": str(store), "studies": 1, "trials": 4, "traces": 4, "findings": []}
@@ -80,7 +80,7 @@ def test_check_of_a_damaged_store_ends_with_1(damaged, run):
     code, out, _ = run("store", "check", damaged)
     assert code == 1
     assert "study 'red quick', trial 2: its trace is damaged" in out
-    assert "4 trials, 3 traces are whole; 1 findings" in out
+    assert "4 trials, 3 traces are whole; 1 finding" in out
     assert "store salvage" in out
     code, out, _ = run("store", "check", damaged, "--json")
     assert code == 1
@@ -92,7 +92,7 @@ def test_salvage(damaged, run, tmp_path):
     code, out, _ = run("store", "salvage", damaged, tmp_path / "new.db")
     assert code == 0
     assert "left: study 'red quick', trial 2: its trace is damaged" in out
-    assert "1 studies, 4 trials, 3 traces saved; 1 findings" in out
+    assert "1 study, 4 trials, 3 traces saved; 1 finding" in out
     assert run("store", "check", tmp_path / "new.db")[0] == 0
     assert run("store", "check", damaged)[0] == 1
     code, _, err = run("store", "salvage", damaged, tmp_path / "new.db")

@@ -130,3 +130,14 @@ def test_tune_says_which_trial_is_the_result_and_why(capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "the result is trial 0: it is the best that was measured" in said
     assert "this theta holds for the cell and the start" not in said
+
+
+@pytest.mark.parametrize(("upper", "code"), [(1.2, 1), (4.0, 0)])
+def test_check_says_what_stops_the_first_trial(tmp_path, upper, code):
+    """With resistances of at most 1.2 times what is believed no corner of theta keeps the limits on plants of the prior."""
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY.format(tuner="twin", safety="").replace("upper = 4.0", f"upper = {upper}"))
+    checked = run("check", path, "--json")
+    found = [f["code"] for f in json.loads(checked.stdout)["findings"] if f["severity"] == "error"]
+    assert (checked.returncode, found) == (code, ["no-safe-start"] * code)
+    assert ("no corner of theta keeps every limit" in checked.stdout) == bool(code)

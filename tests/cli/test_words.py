@@ -7,11 +7,14 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from chargetune.battery.baselines.comparison import Row
 from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.charging.evaluate import evaluate
 from chargetune.battery.charging.settings import SensorSettings
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.wording import METRIC_WORDS, limit_words, metric_words, objective_words
-from chargetune.cli.output import metrics_table
+from chargetune.cli.compare import _table as _compare_table
+from chargetune.cli.output import metrics_table, number
 from chargetune.cli.show import show_command
 from chargetune.cli.tune import _start_label
 from chargetune.episode.score import Score
@@ -50,6 +53,14 @@ def test_a_noisy_verdict_says_what_was_judged_and_what_was_seen(problem):
     assert max(map(len, lines)) <= 80
 
 
+def test_compare_has_no_column_of_dashes_and_no_negative_zero(problem):
+    scored, episode, _ = evaluate(problem, None, 0)
+    lines = printed(_compare_table([Row("nominal", episode, scored, {}), Row("lost", episode, None, {})])).splitlines()
+    assert "over" in lines[0]
+    assert not {"anode", "max"} & set(lines[0].split())
+    assert [number(v) for v in (-0.001, -0.0, 0.006, None)] == ["0.00", "0.00", "0.01", "-"]
+
+
 def test_a_time_that_was_not_reached_is_no_time(problem):
     words = objective_words(problem)
     assert (words.short, words.unit, words.most) == ("t80", "min", 60.0)
@@ -75,8 +86,6 @@ def test_limits_in_their_own_words(problem, name, label, unit, factor):
 
 
 def test_every_figure_of_a_charge_has_words_and_others_keep_theirs(problem):
-    from chargetune.battery.charging.evaluate import evaluate
-
     scored, _, _ = evaluate(problem, None, 0)
     assert set(scored.metrics) <= set(METRIC_WORDS)
     assert metric_words("peak_tilt_rad") == ("peak tilt", "rad")

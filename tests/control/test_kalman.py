@@ -292,7 +292,7 @@ def test_the_memory_is_part_of_a_control_step():
     ("make", "words"),
     [
         (lambda: ExtendedKalman(("q",), (0.1,), (0, 0), (1, 1)).signals(linear()), ["'q'", "y, w"]),
-        (lambda: ExtendedKalman(("y",), (0.1,), (0,), (1, 1)).signals(linear()), ["process_sd", "1 values"]),
+        (lambda: ExtendedKalman(("y",), (0.1,), (0,), (1, 1)).signals(linear()), ["process_sd", "1 value,"]),
         (lambda: ExtendedKalman(("y",), (0.1, 0.2), (0, 0), (1, 1)), ["measurement_sd", "2 values"]),
         (lambda: ExtendedKalman(("y", "y"), (0.1, 0.2), (0, 0), (1, 1)), ["measured", "different names"]),
         (lambda: ExtendedKalman(("y",), (0.0,), (0, 0), (1, 1)), ["measurement_sd", "> 0"]),

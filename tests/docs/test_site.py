@@ -38,6 +38,15 @@ def test_every_command_is_documented():
     assert "\n## store check\n" in page
 
 
+def test_the_ways_to_a_real_cycler_are_found_from_the_menu():
+    """A bench joins the loop as a plant, stepwise or by its CSV: the first page says so, and the page shows each in code that runs."""
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert all(word in index for word in ("cycler", "stepwise", "CSV", "how-to/device-in-the-loop"))
+    page = (DOCS / "how-to" / "device-in-the-loop.md").read_text(encoding="utf-8")
+    assert all(f"{name}(" in page for name in ("run_episode", "act", "recorded_episode"))
+    assert "not run" not in page
+
+
 def test_every_page_is_in_the_menu():
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     menu = text + SITE["hidden"]("index", text)

@@ -327,7 +327,7 @@ def test_what_is_measured_is_the_truth_and_the_table_there(charging):
 def test_an_ensemble_refuses_what_does_not_belong_to_it(charging):
     controller, plant = loop(charging, "ideal")
     episodes = compiled_episode(controller, plant, 10)
-    with pytest.raises(ValueError, match="2 thetas, 1 plants, 1 seeds, 1 tables and 1 given, allowed are as many of each"):
+    with pytest.raises(ValueError, match="2 thetas, 1 plant, 1 seed, 1 table and 1 given, allowed are as many of each"):
         episodes.run_each([THETA, THETA], [plant])
     other = replace(plant, model=replace(plant.model, f=ca.Function("f", list(plant.model.f.sx_in()), [plant.model.f.sx_in()[0]])))
     with pytest.raises(ValueError, match=r"plants\[1\] has another model"):

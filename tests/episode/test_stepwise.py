@@ -137,8 +137,8 @@ def out_of_memory(_u):
     ("fourth", "message"),
     [
         (out_of_memory, "the controller raised RuntimeError: out of memory"),
-        (lambda u: u * math.nan, "the controller raised ValueError: input = [nan], allowed are 1 finite numbers"),
-        (lambda u: np.concatenate([u, u]), "allowed are 1 finite numbers"),
+        (lambda u: u * math.nan, "the controller raised ValueError: input = [nan], allowed: 1 finite number"),
+        (lambda u: np.concatenate([u, u]), "allowed: 1 finite number"),
     ],
 )
 def test_a_broken_control_step_leaves_the_plant_safe(tank_controller, tank_plant, fourth, message):

@@ -148,7 +148,7 @@ def test_where_nothing_that_was_tried_is_safe_nothing_is_proposed():
     """The space ends where the loss is believed too small on the plant, which one trial shows."""
     narrow = ParameterSpace((Parameter("loss", 0.3, 1.0, 1.0, size=3),))
     trials = [Plant().trial(0, SPACE.default)]
-    with pytest.raises(NoSafeThetaError, match=r"no theta keeps every limit .* 1 trials show; nothing was proposed"):
+    with pytest.raises(NoSafeThetaError, match=r"no theta keeps every limit .* 1 trial can show; nothing was proposed"):
         SAFE.ask(narrow, trials)
 
 

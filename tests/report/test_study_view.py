@@ -29,8 +29,8 @@ def test_the_view_is_what_the_store_holds(stores):
     [
         ("mixed", 0, 8, "tuned"),
         ("failed", 0, None, "tuned"),
-        ("violating", 0, "closest", "tuned, violating"),
-        ("ei", 0, "G", "tuned, violating"),
+        ("violating", 0, "closest", "tuned, over a limit"),
+        ("ei", 0, "G", "tuned, over a limit"),
     ],
 )
 def test_untuned_and_tuned_trial(stores, kind, untuned, tuned, label):

@@ -30,8 +30,8 @@ class Finding:
 
     code
         Which check: wrong-sign, unsafe-start, inexact-penalty, between-samples, limit-not-kept, short-horizon,
-        no-influence, no-safe-theta, unreachable-target, no-theta, limit-above-full, steps-not-solved, non-convex, observer-rings,
-        observer-undetectable.
+        no-influence, no-safe-theta, no-safe-start, unreachable-target, no-theta, limit-above-full, steps-not-solved, non-convex,
+        observer-rings, observer-undetectable.
     severity
         "error": what tuning would give is meaningless or unsafe; "warning": it is worth less than it could be.
     numbers

@@ -20,6 +20,7 @@ from chargetune.episode.episode import Episode
 from chargetune.model.given import Given, checked_given, windows
 from chargetune.model.model import Model
 from chargetune.plants.simulated import SimulatedPlant
+from chargetune.runtime.counted import counted
 
 __all__ = ["check_formulation", "check_limits", "check_longer_horizon", "perfect_plant"]
 
@@ -144,9 +145,9 @@ def check_longer_horizon(controller: Controller, run: Episode, theta: ArrayLike 
         Finding(
             "short-horizon",
             "warning",
-            f"with a horizon of {longer} intervals instead of {controller.horizon} the closed loop on a perfect model costs "
+            f"with a horizon of {counted(longer, 'interval')} instead of {controller.horizon} the closed loop on a perfect model costs "
             f"{100 * (1 - better / near):.0f} % less: this one is too short to see what it is for",
-            f"a horizon of {longer} intervals, or a terminal cost that stands for what comes later",
+            f"a horizon of {counted(longer, 'interval')}, or a terminal cost that stands for what comes later",
             {"horizon_intervals": float(controller.horizon), "cost": near, "longer_intervals": float(longer), "cost_longer": better},
             Evidence(
                 "time (min)",
@@ -238,7 +239,7 @@ def _not_known(controller: Controller, limit: LimitRows, run: Episode, seen: NDA
     return Finding(
         "limit-not-kept",
         "warning",
-        f"{limit.of} or its bound is no number in {np.sum(lost)} of {len(run)} intervals of a perfect model, first after "
+        f"{limit.of} or its bound is no number in {np.sum(lost)} of {counted(len(run), 'interval')} of a perfect model, first after "
         f"{run.time_s[np.argmax(lost)] / 60:.3g} min: a limit that is not known is not kept",
         f"an expression of {limit.of} and of its bound that is defined wherever the model goes",
         {"intervals": float(np.sum(lost)), "first_min": float(run.time_s[np.argmax(lost)] / 60)},

@@ -13,6 +13,7 @@ from chargetune.checks.finding import Evidence, Finding
 from chargetune.control.control_step import numbers, problem_of
 from chargetune.control.controller import Controller, LimitRows
 from chargetune.model.model import Model
+from chargetune.runtime.counted import counted
 
 __all__ = [
     "amount",
@@ -218,7 +219,7 @@ def check_horizon(
             "warning",
             f"the horizon spans {span:.3g} s, less than half of the model's fastest time constant, {constant:.3g} s "
             "(the median along the closed loop): the controller acts almost as if the model had no dynamics",
-            f"a horizon of at least {least} intervals, or a longer sampling time",
+            f"a horizon of at least {counted(least, 'interval')}, or a longer sampling time",
             {
                 "horizon_s": span,
                 "time_constant_s": constant,

@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from chargetune import __version__
+from chargetune.battery.identification.layouts import CLOCKS, SHORT_UNITS
 from chargetune.cli.terminal import any_terminal
 from chargetune.runtime.interrupts import INTERRUPTED, Watch, handled_interrupts
 
@@ -300,9 +301,11 @@ def identify(
         typer.Option(help="What a positive current does; unsigned: the voltage tells of each stretch.", show_default="from the file"),
     ] = None,
     time_unit: Annotated[
-        str | None, typer.Option("--time-unit", help="s, ms, min, h, hh:mm or mm:ss.", show_default="from the heading")
+        str | None, typer.Option("--time-unit", help=f"{', '.join((*SHORT_UNITS['time'], *CLOCKS))}.", show_default="from the heading")
     ] = None,
-    current_unit: Annotated[str | None, typer.Option("--current-unit", help="A or mA.", show_default="from the heading")] = None,
+    current_unit: Annotated[
+        str | None, typer.Option("--current-unit", help=f"{', '.join(SHORT_UNITS['current'])}.", show_default="from the heading")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:

@@ -18,6 +18,7 @@ from chargetune.battery.studies.campaign import Entry, Standing, load_campaign, 
 from chargetune.cli.check import print_findings
 from chargetune.cli.output import console, number, shown, workers_for
 from chargetune.cli.outputs import Kind, Output, claim, read_by
+from chargetune.runtime.counted import counted
 from chargetune.study.executors import process_executor
 from chargetune.study.store.store import Store
 
@@ -33,12 +34,12 @@ def campaign_command(path: Path, *, store: str | None, workers: int, force: bool
     read = {e.source: read_by(e.folder / Path(e.source).name, e.config.model_dump()) for e in entries}
     if "://" not in kept:
         inputs = [path, *(file for files in read.values() for file in files)]
-        claim([Output("store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
+        claim([Output("--store", Path(kept), Kind.STORE, renewed=True)], inputs=inputs, overwrite=False)
     _check(entries, force=force)
     with Store(kept) as opened:
         found = standings(opened, entries)
     screen = console(stderr=True)
-    workers = workers_for(workers, len(entries), "studies")
+    workers = workers_for(workers, len(entries), ("study", "studies"))
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers))
         live = None if as_json else stack.enter_context(Live(_table(found.values(), screen.height), console=screen, transient=True))
@@ -78,11 +79,11 @@ def _table(rows: Any, height: int | None = None) -> Table:
     title = None
     if height is not None and len(rows) > (fit := max(3, height - 6)):
         done = sum(row.state == "done" for row in rows)
-        title = f"{len(rows)} studies, {done} done"
+        title = f"{counted(len(rows), 'study', 'studies')}, {done} done"
         order = {"running": 0, "stopped": 1, "waiting": 2, "done": 3}
         rows = sorted(rows, key=lambda row: order[row.state])[:fit]
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    for heading in ("study", "", "trials", "failed", "violating", "best", "t80 min", "t95 min"):
+    for heading in ("study", "", "trials", "failed", "over", "best", "t80 min", "t95 min"):
         table.add_column(heading, justify="left" if heading in ("study", "") else "right", no_wrap=True)
     for row in rows:
         score = row.best.score if row.best is not None and row.best.feasible else None

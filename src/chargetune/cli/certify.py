@@ -20,6 +20,7 @@ from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.cli.output import beside, console, number, workers_for
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
 from chargetune.study.result import read_result
@@ -52,7 +53,9 @@ def certify_command(
     with Store(location, read_only=True) as store:
         names = [record.name for record in store.studies()]
         if study is None and len(names) != 1:
-            raise ValueError(f"{store.label} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
+            raise ValueError(
+                f"{store.label} holds {counted(len(names), 'study', 'studies')}, choose one with --study: {', '.join(names) or '(none)'}"
+            )
         record = store.study(study or names[0])
         trials = store.trials(record.id)
         result = read_result(store, record, trials)
@@ -73,12 +76,11 @@ def certify_command(
     target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
-    what = "certificate" if output is None else "--output"
-    outputs = [Output(what, target, Kind.CERTIFICATE), Output(f"{what}'s figure", target.with_suffix(".png"), Kind.PNG)]
+    outputs = [Output("--output", target, Kind.CERTIFICATE), Output("--output's figure", target.with_suffix(".png"), Kind.PNG)]
     claim(outputs, inputs=[location], overwrite=overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     charges: list[Charge] = []
-    workers = workers_for(workers, episodes, "episodes")
+    workers = workers_for(workers, episodes, ("episode", "episodes"))
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=as_json))
@@ -86,8 +88,8 @@ def certify_command(
         for portion in run_charges(problem, best.theta, seed=seed, episodes=episodes, executor=executor):
             raise_lost_interrupt()
             charges += portion
-            violating = sum(charge.score is None or not charge.score.feasible for charge in charges)
-            progress.update(task, advance=len(portion), note=f"{violating} violating")
+            over = sum(charge.score is None or not charge.score.feasible for charge in charges)
+            progress.update(task, advance=len(portion), note=f"{over} over")
     certificate = write_certificate(
         target,
         problem,
@@ -133,7 +135,7 @@ def _print(certificate: dict[str, Any]) -> None:
     screen = console()
     screen.print(
         f"[bold]{escape(certificate['cell']['name'])}[/], study {escape(repr(origin['study']))}, trial {origin['trial']}: "
-        f"{f['episodes']} fresh episodes, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
+        f"{counted(f['episodes'], 'fresh episode')}, {f['violations']} broke a limit ({f['not_completed']} did not come to their end)",
         soft_wrap=True,
     )
     screen.print(f"trial {origin['trial']}: {origin['why']}", style="dim", markup=False, soft_wrap=True)

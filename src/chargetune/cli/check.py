@@ -12,19 +12,21 @@ from typing import Any
 from rich.console import Console
 
 from chargetune.battery.charging.checks import check_charging
-from chargetune.battery.studies.study_file import load_config
+from chargetune.battery.charging.problem import ChargingProblem
+from chargetune.battery.studies.study_file import Config, load_config
 from chargetune.checks.finding import Finding
 from chargetune.cli.output import console, setting
 from chargetune.cli.outputs import Kind, Output, claim, read_by
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 
 __all__ = ["check_command", "facts", "print_findings"]
 
 
-# A controller without theta can be simulated and compared, and not tuned.
+# A controller without theta can be simulated and compared, and not tuned, which is what a check is for.
 NO_THETA = Finding(
     "no-theta",
-    "warning",
+    "error",
     "theta is empty: there is nothing to tune, and tune refuses it",
     "add a table [theta.backoff], [theta.R0] or [theta.R1]",
     {},
@@ -48,6 +50,8 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
     else:
         with console(stderr=True).status("running closed loops"):
             findings = check_charging(problem, start=start)
+    if not any(finding.severity == "error" for finding in findings):
+        findings = (*_first_trial(config, problem), *findings)
     raise_lost_interrupt()
     if not problem.space.dimension:
         findings = (NO_THETA, *findings)
@@ -70,6 +74,23 @@ def check_command(path: Path, *, safe: str | None, figures: Path | None, overwri
         sys.exit(1)
 
 
+def _first_trial(config: Config, problem: ChargingProblem) -> tuple[Finding, ...]:
+    """Whether safe mode has a theta to begin with. Over a range of use that takes minutes, and is left to the study."""
+    if problem.safety is None or problem.safe_start is not None or problem.range is not None or not problem.space.dimension:
+        return ()
+    from chargetune.battery.studies.open_study import make_tuner
+    from chargetune.learning import NoSafeThetaError
+
+    try:
+        with config.named():
+            tuner = make_tuner(config.study.tuner, config.study.seed, problem, config.twin)
+        tuner.ask(problem.space, [])
+    except NoSafeThetaError as error:
+        remedy = "a start that is known to keep them ([safety] start), wider bounds of theta, or a smaller spread in [twin]"
+        return (Finding("no-safe-start", "error", str(error), remedy, {}),)
+    return ()
+
+
 def print_findings(findings: Sequence[Finding], screen: Console) -> None:
     """Each finding with what to do, two lines."""
     for finding in findings:
@@ -83,7 +104,7 @@ def print_findings(findings: Sequence[Finding], screen: Console) -> None:
 def summary(findings: Sequence[Finding]) -> str:
     """How many of each."""
     errors = sum(f.severity == "error" for f in findings)
-    return f"{errors} errors, {len(findings) - errors} warnings" if findings else "nothing found"
+    return f"{counted(errors, 'error')}, {counted(len(findings) - errors, 'warning')}" if findings else "nothing found"
 
 
 def facts(finding: Finding) -> dict[str, Any]:

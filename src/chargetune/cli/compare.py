@@ -17,6 +17,7 @@ from chargetune.cli.output import console, number, result_line, setting, shown, 
 from chargetune.cli.outputs import Output, claim, figure_kind, read_by
 from chargetune.cli.tune import bar
 from chargetune.report.figures.style import check_format
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.executors import process_executor
 from chargetune.study.result import StudyResult, read_result
@@ -40,7 +41,7 @@ def compare_command(
 ) -> None:
     """Charge the plant of a study file, or those drawn from its range of use, in every way there is, and print one table."""
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     config = load_config(path)
     if figure is not None:
         read: list[str | Path] = [*read_by(path, config.model_dump()), *([] if store is None else [store])]
@@ -58,7 +59,7 @@ def compare_command(
     if draws is not None:
         raise ValueError(f"--draws {draws}: allowed only for a study with a table [range]")
     names = chosen_rows(row_names(problem, theta), rows)
-    workers = workers_for(workers, len(names), "controllers")
+    workers = workers_for(workers, len(names), ("controller", "controllers"))
     found: dict[str, Row] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -81,8 +82,8 @@ def compare_command(
     screen = console()
     screen.print(_table(done))
     screen.print(
-        "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), least anode potential, "
-        "highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
+        "[dim]Judged without sensor noise: voltage over its limit (negative: the distance kept), and where there are some the least anode "
+        "potential and the highest temperature. CC-CV and steps keep the voltage exactly, the plant oracle every limit: it knows the plant "
         "and is what can be reached. Chosen is what was set on this very plant: CC-CV's fastest rate and the smallest "
         "constant backoff with which every limit is kept.[/]"
     )
@@ -106,7 +107,7 @@ def _over_range(
     as_json: bool,
 ) -> None:
     names = chosen_rows(range_row_names(problem, theta), wanted)
-    workers = workers_for(workers, len(names), "controllers")
+    workers = workers_for(workers, len(names), ("controller", "controllers"))
     found: dict[str, RangeRow] = {}
     with ExitStack() as stack:
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
@@ -134,9 +135,9 @@ def _over_range(
     screen.print(table)
     line = "" if problem.range is None else problem.range.line
     screen.print(
-        f"Range of use: {line}. The same {draws} drawn plants in every row, judged by their true outputs. CC-CV has the fastest rate, and "
-        "the constant backoff the smallest value, with which all of these plants keep every limit, or the most cautious one if none "
-        "does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
+        f"Range of use: {line}. The same {counted(draws, 'drawn plant')} in every row, judged by their true outputs. CC-CV has the "
+        "fastest rate, and the constant backoff the smallest value, with which all of these plants keep every limit, or the most "
+        "cautious one if none does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
         style="dim",
     )
     if result is not None:
@@ -195,20 +196,18 @@ def _extreme(row: Row, signal: str, *, largest: bool, factor: float) -> float | 
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for heading in ("", "chosen", "t80\nmin", "t90\nmin", "over\nmV", "anode\nmV", "max\nK", "limits"):
+    """A column for what some row has: a study without anode or temperature has none for them."""
+    table, facts = Table(box=None, pad_edge=False), [_facts(row) for row in rows]
+    columns = {
+        "t80\nmin": [number(one["t80_min"]) for one in facts],
+        "t90\nmin": [number(one["t90_min"]) for one in facts],
+        "over\nmV": [number(one["worst_excess"]["voltage_mV"], 1) for one in facts],
+        "anode\nmV": [number(one["anode_potential_min_mV"], 1) for one in facts],
+        "max\nK": [number(one["temperature_max_K"], 1) for one in facts],
+    }
+    told = {heading: values for heading, values in columns.items() if {*values} != {"-"}}
+    for heading in ("", "chosen", *told, "limits"):
         table.add_column(heading, justify="left" if heading in ("", "chosen", "limits") else "right", no_wrap=heading != "")
-    for row in rows:
-        facts = _facts(row)
-        excess = facts["worst_excess"]
-        table.add_row(
-            row.name,
-            row.setting,
-            number(facts["t80_min"]),
-            number(facts["t90_min"]),
-            number(excess["voltage_mV"], 1),
-            number(facts["anode_potential_min_mV"], 1),
-            number(facts["temperature_max_K"], 1),
-            "[red]broken[/]" if row.breaks_limit else "kept",
-        )
+    for row, *values in zip(rows, *told.values(), strict=True):
+        table.add_row(row.name, row.setting, *values, "[red]broken[/]" if row.breaks_limit else "kept")
     return table

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from rich.console import Console
@@ -19,7 +21,7 @@ from chargetune.battery.identification.cycler_files import Reading, read_record
 from chargetune.battery.identification.open_circuit import Branch
 from chargetune.battery.identification.pulse_fit import SETS_MIN, Identification, cell_toml, identify, predicted_voltage
 from chargetune.battery.identification.pulses import ZERO_CELSIUS_K, find_pulse_sets, set_temperatures
-from chargetune.battery.identification.record import Record, segments
+from chargetune.battery.identification.record import Record, assumptions_told, segments
 from chargetune.battery.identification.thermal import activation_energy
 from chargetune.cli.output import console
 from chargetune.cli.outputs import Kind, Output, claim, figure_kind
@@ -30,6 +32,33 @@ from chargetune.study.files import write_whole
 __all__ = ["identify_command"]
 
 
+class Check(NamedTuple):
+    """A discharge that was predicted with the cell, and what was assumed, mended or left out when its file was read."""
+
+    file: str
+    rate_C: float
+    rms_mV: float
+    worst_mV: float
+    remarks: tuple[str, ...]
+
+
+# The options that a refusal calls by the names of the Python interface.
+OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("time_unit", "current_unit", "capacity_Ah")} | {
+    "temperature_C": "--temperature"
+}
+
+
+@contextmanager
+def _options_named() -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        if type(error) is not ValueError:
+            raise
+        raise ValueError(re.sub(rf"\b({'|'.join(OPTIONS)}) = ", lambda found: f"{OPTIONS[found[1]]} = ", str(error))) from error
+
+
+@_options_named()
 def identify_command(
     data: Path,
     *,
@@ -51,7 +80,7 @@ def identify_command(
 ) -> None:
     """Fit a cell to measured pulses, at each temperature where there are several, write it, and say how well it fits."""
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     reading = Reading(cast("Sign | None", sign), *units, series=series, parallel=parallel)
     read = [data, *([] if ocv is None else [ocv]), *check]
     record = read_record(data, reading)
@@ -73,7 +102,7 @@ def identify_command(
         )
         today = datetime.now().astimezone().date().isoformat()
         found = replace(found, cell=replace(found.cell, remark=f"{found.cell.remark} Fitted {today}.", series=series, parallel=parallel))
-        results.append((t, found, [(one.source, *_check(found, one)) for one in known]))
+        results.append((t, found, [_check(found, one) for one in known]))
     raise_lost_interrupt()
     for t, found, _ in results:
         _write(found, cast("Path", outs[t]), figures[t])
@@ -129,7 +158,7 @@ def _write(found: Identification, out: Path, figure: Path | None) -> None:
         save(identification_figure(replace(found, cell=cell)), figure)
 
 
-def _document(found: Identification, checks: list[tuple[str, float, float, float]]) -> dict[str, Any]:
+def _document(found: Identification, checks: list[Check]) -> dict[str, Any]:
     points = [
         {"set": fit.number, "soc": fit.soc, "rms_mV": 1e3 * fit.rms_V, "ocv_V": fit.ocv_V, "values": fit.values, "sd": fit.sd}
         for fit in found.fits
@@ -139,28 +168,31 @@ def _document(found: Identification, checks: list[tuple[str, float, float, float
         "capacity_Ah": found.cell.capacity_Ah,
         "seconds": found.seconds,
         "remarks": list(found.remarks),
-        "checks": [{"file": file, "rate_C": rate, "rms_mV": rms, "worst_mV": worst} for file, rate, rms, worst in checks],
+        "checks": [check._asdict() for check in checks],
     }
 
 
-def _show(screen: Console, found: Identification, checks: list[tuple[str, float, float, float]]) -> None:
+def _show(screen: Console, found: Identification, checks: list[Check]) -> None:
     screen.print(_table(found))
     for remark in found.remarks:
         screen.print(remark, style="dim", markup=False, soft_wrap=True)
-    for file, rate, rms, worst in checks:
-        line = f"{file}: discharge at {rate:.2f}C predicted with {rms:.1f} mV rms, {worst:.0f} mV at worst"
+    for check in checks:
+        line = f"{check.file}: discharge at {check.rate_C:.2f}C predicted with {check.rms_mV:.1f} mV rms, {check.worst_mV:.0f} mV at worst"
         screen.print(line, markup=False, soft_wrap=True)
+        for remark in check.remarks:
+            screen.print(f"{check.file}: {remark}", style="dim", markup=False, soft_wrap=True)
 
 
-def _check(found: Identification, record: Record) -> tuple[float, float, float]:
-    """(rate in 1/h, rms mV, worst mV) of the voltage predicted for the first full discharge of a record, from a full cell at rest."""
+def _check(found: Identification, record: Record) -> Check:
+    """How the voltage is predicted for the first full discharge of a record, from a full cell at rest."""
     for first, last, sign in segments(record):
         if sign < 0 and -record.part(first, last).charge_Ah[-1] > 0.5 * found.cell.capacity_Ah:
             _, measured, predicted = predicted_voltage(found.cell, record.part(max(first - 1, 0), last), 1.0)
             error = 1e3 * (predicted - measured)
             rate = -float(np.median(record.current_A[first:last])) / found.cell.capacity_Ah
-            return rate, float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error)))
-    raise ValueError(f"{record.source}: no discharge of at least half the capacity, so there is nothing to check the cell against")
+            return Check(record.source, rate, float(np.sqrt(np.mean(error**2))), float(np.max(np.abs(error))), record.remarks)
+    with assumptions_told(record):
+        raise ValueError(f"{record.source}: no discharge of at least half the capacity, so there is nothing to check the cell against")
 
 
 def _table(found: Identification) -> Table:

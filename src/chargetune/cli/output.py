@@ -56,7 +56,8 @@ def shown(location: str) -> str:
 
 def number(value: float | None, digits: int = 2) -> str:
     """A figure, or a dash where the episode never got there."""
-    return "-" if value is None else f"{value:.{digits}f}"
+    # Adding zero to a negative one that is rounded takes its sign.
+    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def result_line(result: StudyResult) -> str:
@@ -114,7 +115,7 @@ def plants_over(score: Score | None) -> str:
     return f"{drawn['violating_plants']:.0f} of {drawn['plants']:.0f}" if "plants" in drawn else "-"
 
 
-def workers_for(wanted: int, work: int, what: str) -> int:
+def workers_for(wanted: int, work: int, what: tuple[str, str]) -> int:
     """The number of worker processes; where fewer than wanted can have something to do, one line on stderr says so."""
     count, said = bounded_workers(wanted, work, what)
     if said:

@@ -57,7 +57,8 @@ FIGURES = {".png": Kind.PNG, ".pdf": Kind.PDF, ".svg": Kind.SVG}
 class Output:
     """A file that a command is going to write.
 
-    ``what`` is how a message begins: the option, or what the file is. ``renewed``: it is this command's own from an earlier run,
+    ``what`` is how a message begins: the option that names the file, also where it has its default, so that one knows how to choose
+    another. ``renewed``: it is this command's own from an earlier run,
     which the same command continues.
     """
 
@@ -180,10 +181,16 @@ def _may(output: Output, *, overwrite: bool) -> None:
     found = kind_of(path)
     if found not in (output.kind, Kind.EMPTY):
         raise ValueError(
-            f"{output.what} {path}: there is a {found} of this name, which a {output.kind} does not replace; choose another name"
+            f"{output.what} {path}: there is {_article(found)} of this name, which {_article(output.kind)} does not replace; "
+            "choose another name"
         )
     if not overwrite and not output.renewed:
         raise ValueError(f"{output.what} {path}: exists; --overwrite replaces it")
+
+
+def _article(kind: Kind) -> str:
+    """The kind with its article: an HTML page, a cell file."""
+    return f"{'an' if kind in (Kind.PAGE, Kind.SVG, Kind.EMPTY) else 'a'} {kind}"
 
 
 def _can(output: Output, *, folders: bool) -> None:
@@ -193,4 +200,7 @@ def _can(output: Output, *, folders: bool) -> None:
     place = path.resolve()
     if not place.parent.exists() and not folders:
         raise ValueError(f"{output.what} {path}: there is no folder {path.parent}")
-    try_whole(place)
+    try:
+        try_whole(place)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, f"{output.what} {path}") from error

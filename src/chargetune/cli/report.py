@@ -12,6 +12,7 @@ from chargetune.report import figure_names, read_study, save_figures
 from chargetune.report.page.evidence_sections import certificate_of
 from chargetune.report.page.page import evaluations, report_page
 from chargetune.report.study_view import read_studies
+from chargetune.runtime.counted import counted
 from chargetune.study.files import write_whole
 
 __all__ = ["report_command"]
@@ -32,10 +33,12 @@ def report_command(
     if study is None:
         names = [view.name for view in read_studies(location)]
         if len(names) != 1:
-            raise ValueError(f"{shown(location)} has {len(names)} studies, choose one by --study: {', '.join(names) or '(none)'}")
+            raise ValueError(
+                f"{shown(location)} has {counted(len(names), 'study', 'studies')}, choose one by --study: {', '.join(names) or '(none)'}"
+            )
         study = names[0]
     target = out or beside(location, ".html")
-    page = Output("page" if out is None else "--output", target, Kind.PAGE)
+    page = Output("--output", target, Kind.PAGE)
     claim([page], inputs=[location], overwrite=overwrite, folders=False)
     view = read_study(location, study)
     vectors = [] if figures is None else [Output("--figures", figures / f"{stem}.pdf", Kind.PDF) for stem in figure_names(view)]

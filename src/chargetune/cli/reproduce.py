@@ -14,6 +14,7 @@ from chargetune.battery.studies.study_file import TunerName
 from chargetune.cli.output import console, number, workers_for
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.cli.tune import bar
+from chargetune.runtime.counted import counted
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
 
@@ -47,7 +48,7 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     own = overwrite or _is_claims(tables[0])
     claim(
         [
-            Output("store", path, Kind.STORE, renewed=True),
+            Output("--out", path, Kind.STORE, renewed=True),
             *(Output("--out", table, Kind.JSON, renewed=own) for table in tables),
             Output("--out", out / f"{case}-{tuner}-seeds.png", Kind.PNG, renewed=own),
             *(Output("--out", drawn / f"{stem}.png", Kind.PNG, renewed=own) for stem in ("trajectories", "backoff", "R1", "convergence")),
@@ -56,7 +57,7 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
         overwrite=overwrite,
     )
     out.mkdir(parents=True, exist_ok=True)
-    workers = workers_for(workers, len(numbers), "seeds")
+    workers = workers_for(workers, len(numbers), ("seed", "seeds"))
     with process_executor(workers) as executor, bar(quiet=as_json) as progress:
         task = progress.add_task(f"{case}, {tuner}", total=len(numbers), note="")
         safe = 0
@@ -65,7 +66,9 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
             nonlocal safe
             tuned = row["tuned"]
             safe += bool(tuned and tuned["overshoot_mV"] <= 1.0)
-            progress.update(task, advance=1, note=f"seed {seed}: t95 {number(tuned['t95_min'] if tuned else None)} min; {safe} seeds safe")
+            progress.update(
+                task, advance=1, note=f"seed {seed}: t95 {number(tuned['t95_min'] if tuned else None)} min; {counted(safe, 'seed')} safe"
+            )
 
         rows = reproduce(case, numbers, trials=trials, tuner=name, path=path, executor=executor, progress=note)
     result = summarise(out, case, name, rows, trials)
@@ -84,8 +87,8 @@ def reproduce_command(case: str, *, seeds: str, trials: int, tuner: str, workers
     )
     if case == "rbf":
         screen.print("cautious cost: what the safe twin begins with; oracle: the untuned controller that knows the cell", soft_wrap=True)
-    screen.print(f"\n{summary['safe']} of {summary['of']} seeds within 1 mV, median t95 {number(summary['t95_min_median'])} min, "
-                 f"{summary['violating_trials']} of {summary['all_trials']} trials violated")  # fmt: skip
+    screen.print(f"\n{summary['safe']} of {counted(summary['of'], 'seed')} within 1 mV, median t95 {number(summary['t95_min_median'])}"
+                 f" min, {summary['violating_trials']} of {counted(summary['all_trials'], 'trial')} over the limit")  # fmt: skip
     table = Table(box=None, pad_edge=False, title="Claims", title_justify="left")
     for heading in ("", "claim", "holds"):
         table.add_column(heading)

@@ -45,7 +45,7 @@ def show_command(location: str, *, study: str | None, as_json: bool) -> None:
 def _list(views: list[StudyView]) -> None:
     table = Table(box=None, pad_edge=False)
     apart = ("apart",) if any(t.status is TrialStatus.APART for view in views for t in view.trials) else ()
-    for heading in ("study", "trials", "failed", *apart, "violating", "best trial", "its objective", "begun"):
+    for heading in ("study", "trials", "failed", *apart, "over", "best trial", "its objective", "begun"):
         table.add_column(heading, justify="left" if heading in ("study", "its objective", "begun") else "right")
     for view in views:
         s, best = _summary(view), view.result.kept
@@ -83,8 +83,9 @@ def _show_trials(view: StudyView) -> None:
     table.add_column("trial", justify="right", no_wrap=True)
     for heading in ("", "status"):
         table.add_column(heading)
-    for heading in (*columns, *(["plants\nover"] if drawn else []), *map(escape, entries)):
-        table.add_column(heading, justify="right", vertical="bottom")
+    for heading in (*columns, *(["plants\nover"] if drawn else []), *(escape(e.replace("_", "\n_", 1)) for e in entries)):
+        # At 80 columns a name may need several lines; the end of it, its number, is never cut.
+        table.add_column(heading, justify="right", vertical="bottom", overflow="fold")
     table.add_column("limits")
     for t in trials:
         s = t.score

@@ -18,6 +18,7 @@ from chargetune.cli.outputs import Kind, Output, claim, figure_kind, read_by
 from chargetune.report.figures.style import check_format, save
 from chargetune.report.figures.trajectories import episode_figure
 from chargetune.report.page.trial_rows import trace_csv
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import raise_lost_interrupt
 from chargetune.study.files import write_whole
 
@@ -32,7 +33,7 @@ def simulate_command(
     ``figure`` is drawn as its ending says (png, pdf, svg); ``out`` has the trace as CSV, one row an interval.
     """
     if figure is not None:
-        check_format(figure)
+        check_format(figure, "--figure")
     if out is not None and out.suffix.lower() != ".csv":
         raise ValueError(f"--out {out}: allowed is a file that ends with .csv")
     config = load_config(path)
@@ -54,7 +55,7 @@ def simulate_command(
     if score is None:
         # What ended the run can still be looked at.
         raise ValueError(
-            f"the run has no score; it ended after {len(episode)} intervals: {ending}" + "".join(f"\n{line}" for line in written)
+            f"the run has no score; it ended after {counted(len(episode), 'interval')}: {ending}" + "".join(f"\n{line}" for line in written)
         )
     start, end = episode.signal("voltage_V")
     _, soc = episode.signal("soc")
@@ -84,7 +85,7 @@ def simulate_command(
         return
     screen = console()
     screen.print(
-        f"[bold]{escape(problem.cell.title)}[/], {len(episode)} intervals of {problem.controller.sampling_time_s:g} s, "
+        f"[bold]{escape(problem.cell.title)}[/], {counted(len(episode), 'interval')} of {problem.controller.sampling_time_s:g} s, "
         f"ended: {episode.ending.value}"
     )
     for line in problem.setting_lines:
@@ -107,4 +108,8 @@ def parse_theta(text: str, problem: ChargingProblem, option: str) -> NDArray[np.
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise ValueError(f"{option} = {text!r}: expected numbers separated by commas, or a JSON object of named values") from error
-    return problem.space.validate(numbers)
+    space = problem.space
+    if len(numbers) != space.dimension:
+        named = ", ".join(space.entries)
+        raise ValueError(f"{option} has {counted(len(numbers), 'value')}, allowed is one for each of these {space.dimension}: {named}")
+    return space.validate(numbers)

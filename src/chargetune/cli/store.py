@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from chargetune.battery.studies.bdf_export import Format, export, planned_files
 from chargetune.cli.output import console, shown
 from chargetune.cli.outputs import Kind, Output, claim
+from chargetune.runtime.counted import counted
 from chargetune.study.store.damaged_reader import Damage
 from chargetune.study.store.integrity import check_store
 from chargetune.study.store.salvage import salvage
@@ -33,9 +34,9 @@ def check_command(location: str, *, as_json: bool) -> None:
         print(json.dumps({"store": verdict.store, **counts, "findings": _facts(verdict.findings)}))  # noqa: T201
     else:
         _lines(list(map(str, verdict.findings)))
-        closing = f"{len(verdict.findings)} findings" if verdict.findings else "nothing wrong"
+        closing = f"{counted(len(verdict.findings), 'finding')}" if verdict.findings else "nothing wrong"
         remedy = "\n`chargetune store salvage STORE NEW` saves what is whole into a new store" if verdict.findings else ""
-        console().print(f"{verdict.store}: {_counted(counts)} are whole; {closing}{remedy}", markup=False, soft_wrap=True)
+        console().print(f"{verdict.store}: {_all_counted(counts)} are whole; {closing}{remedy}", markup=False, soft_wrap=True)
     if verdict.findings:
         sys.exit(1)
 
@@ -52,8 +53,8 @@ def salvage_command(location: str, target: str, *, as_json: bool) -> None:
         print(json.dumps({"store": saved.store, **counts, "left": _facts(saved.left)}))  # noqa: T201
         return
     _lines([f"left: {finding}" for finding in saved.left])
-    closing = f"{len(saved.left)} findings" if saved.left else "nothing was left"
-    console().print(f"{saved.store}: {_counted(counts)} saved; {closing}", markup=False, soft_wrap=True)
+    closing = f"{counted(len(saved.left), 'finding')}" if saved.left else "nothing was left"
+    console().print(f"{saved.store}: {_all_counted(counts)} saved; {closing}", markup=False, soft_wrap=True)
 
 
 def export_command(location: str, *, out: Path, study: str | None, form: Format, overwrite: bool, as_json: bool) -> None:
@@ -71,7 +72,7 @@ def export_command(location: str, *, out: Path, study: str | None, form: Format,
         print(json.dumps({"files": [str(f) for f in written.files], "left": list(written.left)}))  # noqa: T201
         return
     _lines([f"left: {line}" for line in written.left])
-    console().print(f"{len(written.files)} files in {out}", markup=False, soft_wrap=True)
+    console().print(f"{counted(len(written.files), 'file')} in {out}", markup=False, soft_wrap=True)
 
 
 def migrate_command(location: str, *, as_json: bool) -> None:
@@ -90,8 +91,9 @@ def _facts(findings: Sequence[Damage]) -> list[dict[str, object]]:
     return [{"study": f.study, "trial": f.trial, "what": f.what} for f in findings]
 
 
-def _counted(counts: dict[str, int]) -> str:
-    return ", ".join(f"{number} {name}" for name, number in counts.items())
+def _all_counted(counts: dict[str, int]) -> str:
+    nouns = {"studies": "study", "trials": "trial", "traces": "trace"}
+    return ", ".join(counted(number, nouns[name], name) for name, number in counts.items())
 
 
 def _lines(lines: list[str]) -> None:

@@ -28,6 +28,7 @@ from chargetune.cli.output import console, loss_of, metrics_table, number, resul
 from chargetune.cli.outputs import Kind, Output, claim, read_by
 from chargetune.episode.episode import Ending
 from chargetune.episode.score import Score
+from chargetune.runtime.counted import counted
 from chargetune.runtime.notes import first_line
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
@@ -78,7 +79,7 @@ def tune_command(
     problem = config.problem(path.parent)
     if not problem.space.dimension:
         raise ValueError(f"{path}: theta is empty; add a table [theta.backoff], [theta.R0] or [theta.R1]")
-    outputs = [] if "://" in kept else [Output("store", Path(kept), Kind.STORE, renewed=True)]
+    outputs = [] if "://" in kept else [Output("--store", Path(kept), Kind.STORE, renewed=True)]
     if out is not None:
         outputs += _files(out, config, problem, kept)
     claim(outputs, inputs=read_by(path, config.model_dump()), overwrite=overwrite)
@@ -103,11 +104,13 @@ def tune_command(
         return
     _closing(problem, now, result, config.study.tuner)
     if more:
-        console().print(f"the study has {len(everything) + more} trials; these are the first {len(everything)} of them, as --trials asks")
+        console().print(
+            f"the study has {counted(len(everything) + more, 'trial')}; these are the first {len(everything)} of them, as --trials asks"
+        )
     if safety:
         budget = "" if safety["budget_mVs"] is None else f" of {safety['budget_mVs']:g}"
         spent = f"violation beyond the tolerance: {safety['violation_mVs']:.3g}{budget} mV s"
-        console().print(f"{spent}; {safety['ended_at_a_limit']} trials were ended at a limit")
+        console().print(f"{spent}; {counted(safety['ended_at_a_limit'], 'trial')} ended at a limit")
     console().print(f"trials in {shown(kept)}" + "".join(f"\nfigure {f}" for f in figures), markup=False, soft_wrap=True)
     _end(safety, now)
 
@@ -152,15 +155,15 @@ def _run(
         alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
         alone = alone or config.range is not None
         at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
-        workers = workers_for(workers, at_once, "trials at a time" if alone else "trials")
+        workers = workers_for(workers, at_once, ("trial at a time", "trials at a time") if alone else ("trial", "trials"))
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
         # Without a word before it the line of a trial is whole at 80 columns.
         task = progress.add_task("", total=count, completed=min(done, count), note="")
         if study.earlier and not quiet:
-            progress.console.print(f"begun with {len(study.earlier)} trials of earlier studies")
+            progress.console.print(f"begun with {counted(len(study.earlier), 'trial')} of earlier studies")
         if done and not quiet:
-            progress.console.print(f"resumed: {done} trials are in {shown(kept)}", markup=False, soft_wrap=True)
+            progress.console.print(f"resumed: {counted(done, 'trial')} in {shown(kept)}", markup=False, soft_wrap=True)
 
         def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = ""
@@ -261,7 +264,9 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     screen, best = console(), result.trial
     violating = sum(t.score is not None and not t.score.feasible for t in everything)
     failed = sum(t.status is TrialStatus.FAILED for t in everything)
-    screen.print(f"\n[bold]{escape(problem.cell.title)}[/]: {len(everything)} trials, {violating} broke a limit, {failed} failed")
+    screen.print(
+        f"\n[bold]{escape(problem.cell.title)}[/]: {counted(len(everything), 'trial')}, {violating} broke a limit, {failed} failed"
+    )
     for line in problem.setting_lines:
         screen.print(f"[dim]{escape(line)}[/]")
     if problem.cell.remark:
@@ -277,7 +282,7 @@ def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyRes
     if best is None:
         return
     if not best.feasible:
-        said = f"[red]None of these {len(everything)} trials kept the limits.[/] Shown is the one that came closest."
+        said = f"[red]No trial of {len(everything)} kept the limits.[/] Shown is the one that came closest."
         screen.print(f"{said} More trials or a wider theta may help.")
     units = [p.unit for p in problem.space.parameters for _ in range(p.size)]
     screen.print(result_line(result), markup=False, soft_wrap=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from chargetune.runtime.counted import counted
 from chargetune.verify import verify
 
 __all__ = ["verify_command"]
@@ -23,7 +24,7 @@ def verify_command(path: Path, *, as_json: bool) -> None:
         screen = Console(highlight=False)
         for d in differences:
             screen.print(f"{d.name}: stated {d.stated}, recomputed {d.recomputed}", style="red", markup=False, soft_wrap=True)
-        verdict = f"{len(differences)} figures differ" if differences else "every figure is what the traces give"
+        verdict = f"{counted(len(differences), 'figure')} not as stated" if differences else "every figure is what the traces give"
         screen.print(f"{path}: {verdict}", markup=False, soft_wrap=True)
     if differences:
         sys.exit(1)

@@ -7,6 +7,7 @@ import errno
 import socket
 
 from chargetune.cli.output import console
+from chargetune.runtime.counted import counted
 from chargetune.runtime.interrupts import unwatched
 from chargetune.study.store.store import Store
 
@@ -25,7 +26,7 @@ def web_command(location: str, *, port: int, host: str, token: str | None) -> No
     if token is None and not is_loopback(host):
         raise ValueError(f"--host {host} can be reached from other machines: give a --token of at least {LEAST_TOKEN} characters")
     if token is not None and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise ValueError(f"--token has {len(token)} characters, allowed are at least {LEAST_TOKEN} printable ASCII ones")
+        raise ValueError(f"--token has {counted(len(token), 'character')}, allowed are at least {LEAST_TOKEN} printable ASCII ones")
     with Store(location, read_only=True) as store:
         label = store.label  # what cannot be shown is refused now
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from chargetune.cli.output import console
+from chargetune.runtime.counted import counted
 from chargetune.study.result import read_result
 from chargetune.study.store.store import Store
 
@@ -32,7 +33,9 @@ def show_worth(location: str, *, study: str | None, as_json: bool) -> None:
     with Store(location, read_only=True) as store:
         names = [record.name for record in store.studies()]
         if study is None and len(names) != 1:
-            raise ValueError(f"{store.label} holds {len(names)} studies, choose one with --study: {', '.join(names) or '(none)'}")
+            raise ValueError(
+                f"{store.label} holds {counted(len(names), 'study', 'studies')}, choose one with --study: {', '.join(names) or '(none)'}"
+            )
         record = store.study(study or names[0])
         best = read_result(store, record, store.trials(record.id)).trial
     problem = problem_of_document(record.identity["config"])

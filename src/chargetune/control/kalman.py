@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from chargetune.control.estimators import finite
 from chargetune.model.model import Model, Named
+from chargetune.runtime.counted import counted
 from chargetune.runtime.split import split
 
 __all__ = ["ExtendedKalman", "FilterMemory", "Setting"]
@@ -80,7 +81,8 @@ class ExtendedKalman:
     def __post_init__(self) -> None:
         if len(self.measured) != len(self.measurement_sd) or not self.measured:
             raise ValueError(
-                f"estimator: measurement_sd has {len(self.measurement_sd)} values, expected one for each of {list(self.measured)}"
+                f"estimator: measurement_sd has {counted(len(self.measurement_sd), 'value')}, "
+                f"expected one for each of {list(self.measured)}"
             )
         if len(set(self.measured)) < len(self.measured):
             raise ValueError(f"estimator: measured = {list(self.measured)}, allowed are different names")
@@ -127,7 +129,8 @@ class ExtendedKalman:
         for name in ("process_sd", "start_sd"):
             if len(getattr(self, name)) != len(model.states):
                 raise ValueError(
-                    f"estimator: {name} has {len(getattr(self, name))} values, expected one for each of {list(model.state_names)}"
+                    f"estimator: {name} has {counted(len(getattr(self, name)), 'value')}, "
+                    f"expected one for each of {list(model.state_names)}"
                 )
         return self.measured
 

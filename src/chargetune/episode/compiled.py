@@ -29,6 +29,7 @@ from chargetune.model.given import Given, actual, checked_given, windows
 from chargetune.plants.simulated import SimulatedPlant, disturbances
 from chargetune.runtime.cache import cached
 from chargetune.runtime.compiler import compile_library, compiler_flags, find_compiler
+from chargetune.runtime.counted import counted
 from chargetune.runtime.numpy_call import numpy_call
 from chargetune.runtime.split import split
 from chargetune.runtime.threads import parallel_map
@@ -80,8 +81,9 @@ class CompiledEpisode:
         seeds = [seed] * len(plants) if isinstance(seed, int) else list(seed)
         cases = [given] * len(plants) if given is None or isinstance(given, Mapping) else list(given)
         if not len(thetas) == len(plants) == len(tables) == len(seeds) == len(cases):
-            counts = f"{len(thetas)} thetas, {len(plants)} plants, {len(seeds)} seeds, {len(tables)} tables and {len(cases)} given"
-            raise ValueError(f"{counts}, allowed are as many of each")
+            pairs = ((thetas, "theta"), (plants, "plant"), (seeds, "seed"), (tables, "table"))
+            counts = ", ".join(counted(len(found), name) for found, name in pairs)
+            raise ValueError(f"{counts} and {len(cases)} given, allowed are as many of each")
         for i, plant in enumerate(plants):
             if _content(plant.model.f) != _content(self.plant.model.f) or _content(plant.model.h) != _content(self.plant.model.h):
                 raise ValueError(f"plants[{i}] has another model ({plant.model.name}) than these episodes ({self.plant.model.name})")

@@ -17,6 +17,7 @@ from chargetune.control.sqp import SolveStatus
 from chargetune.episode.episode import BLIND_MAX, Ending, Episode, Trip, ending_at, tripped
 from chargetune.model.given import Given, actual, checked_given, windows
 from chargetune.plants.plant import Measurement, Plant, PlantError, SetUpError
+from chargetune.runtime.counted import counted
 from chargetune.runtime.numeric import is_integer
 
 __all__ = ["check_run", "run_episode", "signal_indices"]
@@ -117,7 +118,7 @@ def _asked(plant: Plant, call: Callable[[], Measurement]) -> Measurement:
 def _refuse_unusable(u: NDArray[np.float64], count: int) -> None:
     # `act` never gives such an input; another control step may, and a plant must not get it.
     if np.shape(u) != (count,) or not np.all(np.isfinite(u)):
-        raise ValueError(f"input = {np.asarray(u).tolist()}, allowed are {count} finite numbers")
+        raise ValueError(f"input = {np.asarray(u).tolist()}, allowed: {counted(count, 'finite number')}")
 
 
 def _closed(plant: Plant) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from chargetune.learning.candidates import Proposal
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.twin.ensemble import episodes_of
+from chargetune.runtime.counted import counted
 
 __all__ = ["safe_thetas"]
 
@@ -40,7 +41,7 @@ def safe_thetas(proposal: Proposal, safety: Safety, count: int = 1) -> list[NDAr
     tried = next((theta for theta in proposal.kept if proposal.holds(theta)), None)
     if tried is None:
         what = f"no theta keeps every limit with probability {safety.probability:g}"
-        raise NoSafeThetaError(f"{what} as far as the {len(proposal.trials)} trials show; nothing was proposed")
+        raise NoSafeThetaError(f"{what} as far as {counted(len(proposal.trials), 'trial')} can show; nothing was proposed")
     aim = (accepted[0] if accepted else last)[0]
     part = proposal.backtrack(tried, aim, proposal.holds)
     if part is None:

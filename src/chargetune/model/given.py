@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.runtime.counted import counted
+
 __all__ = ["Given", "actual", "checked_given", "windows"]
 
 # By name: a number, a sequence with a value for each interval, or a forecast for each interval, shape (steps, N + 1).
@@ -37,7 +39,7 @@ def checked_given(names: Sequence[str], given: Given | None, steps: int, horizon
         if values.ndim > 2 or (values.ndim == 2 and values.shape[1] != horizon + 1):
             raise ValueError(f"given: {name} has shape {values.shape}, allowed is (steps,) or a forecast (steps, {horizon + 1})")
         if len(values) < steps:
-            raise ValueError(f"given: {name} has {len(values)} intervals, allowed are at least the {steps} of the episode")
+            raise ValueError(f"given: {name} has {counted(len(values), 'interval')}, allowed are at least the {steps} of the episode")
         if not np.all(np.isfinite(values)):
             where = np.argwhere(~np.isfinite(values))[0].tolist()
             raise ValueError(f"given: {name}{where} = {values[tuple(where)]}, allowed are finite numbers")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chargetune.model.integrators import rk4
+from chargetune.runtime.counted import counted
 from chargetune.runtime.numeric import is_finite
 from chargetune.runtime.split import split
 
@@ -36,7 +37,7 @@ class Named(Mapping[str, Any]):
     def __init__(self, blocks: Mapping[str, int], vector: Any) -> None:
         self.vector = vector
         if vector.shape[0] != sum(blocks.values()):
-            raise ValueError(f"vector has {vector.shape[0]} rows, expected {sum(blocks.values())} for {', '.join(blocks)}")
+            raise ValueError(f"vector has {counted(vector.shape[0], 'row')}, expected {sum(blocks.values())} for {', '.join(blocks)}")
         self._blocks = dict(zip(blocks, split(vector, blocks.values()), strict=True))
 
     def __getitem__(self, name: str) -> Any:

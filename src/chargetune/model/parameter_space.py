@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.runtime.counted import counted
 from chargetune.runtime.numeric import is_finite, is_integer
 
 __all__ = ["Parameter", "ParameterSpace"]
@@ -44,7 +45,7 @@ class Parameter:
             raise ValueError(f"parameter {self.name}: scale = {self.scale!r}, allowed is 'linear' or 'log'")
         shape = tuple(self.shape) or (self.size,)
         if math.prod(shape) != self.size:
-            raise ValueError(f"parameter {self.name}: shape = {shape}, allowed is one of size = {self.size} entries")
+            raise ValueError(f"parameter {self.name}: shape = {shape}, allowed is one of size = {self.size}")
         object.__setattr__(self, "shape", shape)
         for bound in ("lower", "upper"):
             value = getattr(self, bound)
@@ -56,7 +57,7 @@ class Parameter:
             raise ValueError(f"parameter {self.name}: lower = {self.lower:g}, a log scale needs lower > 0")
         values = self.default if isinstance(self.default, tuple) else (self.default,) * self.size
         if len(values) != self.size:
-            raise ValueError(f"parameter {self.name}: default has {len(values)} values, expected {self.size}")
+            raise ValueError(f"parameter {self.name}: default has {counted(len(values), 'value')}, expected {self.size}")
         for value in values:
             if not is_finite(value) or not self.lower <= value <= self.upper:
                 raise ValueError(f"parameter {self.name}: default = {value!r}, allowed is [{self.lower:g}, {self.upper:g}] {self.unit}")
@@ -139,11 +140,11 @@ class ParameterSpace:
                 size = theta[slices[name]].size
                 if given.shape not in ((), (1,), (size,)):
                     allowed = f"one or {size} numbers" if size > 1 else "one number"
-                    raise ValueError(f"theta: {name} has {given.size} values, allowed is {allowed}")
+                    raise ValueError(f"theta: {name} has {counted(given.size, 'value')}, allowed is {allowed}")
                 theta[slices[name]] = given
             elif name in entries:
                 if given.size != 1:
-                    raise ValueError(f"theta: {name} has {given.size} values, allowed is one number")
+                    raise ValueError(f"theta: {name} has {counted(given.size, 'value')}, allowed is one number")
                 theta[entries.index(name)] = given.item()
             else:
                 raise ValueError(f"theta: unknown name {name!r}, allowed are {', '.join(slices) or '(none)'}")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from chargetune.model.model import Signal
 from chargetune.plants.plant import Measurement, PlantError
+from chargetune.runtime.counted import counted
 
 __all__ = ["GymnasiumPlant"]
 
@@ -39,7 +40,8 @@ class GymnasiumPlant:
         shape = getattr(self.env.action_space, "shape", None)
         if getattr(self.env.action_space, "low", None) is None or not shape or int(np.prod(shape)) != len(self.inputs):
             raise ValueError(
-                f"environment: action space {self.env.action_space}, allowed is a Box of {len(self.inputs)} numbers: {_named(self.inputs)}"
+                f"environment: action space {self.env.action_space}, allowed is "
+                f"a Box of {counted(len(self.inputs), 'number')}: {_named(self.inputs)}"
             )
 
     def reset(self, seed: int) -> Measurement:
@@ -74,7 +76,7 @@ class GymnasiumPlant:
         values = np.asarray(observation, dtype=np.float64).ravel()
         seen = values if self.observe is None else np.asarray(self.observe(values), dtype=np.float64).ravel()
         if seen.shape != (len(self.outputs),):
-            raise ValueError(f"environment: {seen.size} numbers are observed, expected {len(self.outputs)}: {_named(self.outputs)}")
+            raise ValueError(f"environment: observed: {counted(seen.size, 'number')}, expected {len(self.outputs)}: {_named(self.outputs)}")
         return seen
 
 

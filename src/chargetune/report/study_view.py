@@ -109,7 +109,7 @@ class StudyView:
     @property
     def tuned_label(self) -> str:
         """What a legend calls the tuned trial, so that nobody takes one that broke a limit for a success."""
-        return "tuned" if self.tuned is None or self.tuned.feasible else "tuned, violating"
+        return "tuned" if self.tuned is None or self.tuned.feasible else "tuned, over a limit"
 
     @property
     def tuned_dashes(self) -> str:

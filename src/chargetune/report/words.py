@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from chargetune.battery.charging.wording import LimitWords, ObjectiveWords, limit_words, objective_words
+from chargetune.battery.charging.wording import LimitWords, ObjectiveWords, limit_words, metric_words, objective_words
 from chargetune.report.study_view import StudyView
 
-__all__ = ["limits_of_study", "objective_of_study"]
+__all__ = ["MetricWords", "limits_of_study", "metrics_of_study", "objective_of_study"]
+
+
+@dataclass(frozen=True)
+class MetricWords:
+    """How a figure of merit is told: ``factor`` times what is stored, in ``unit``."""
+
+    label: str
+    unit: str
+    factor: float = 1.0
 
 
 def limits_of_study(view: StudyView) -> list[LimitWords]:
@@ -37,3 +46,14 @@ def objective_of_study(view: StudyView) -> ObjectiveWords:
     if view.problem is not None:
         return objective_words(view.problem, view.tuner)
     return ObjectiveWords("-G", "-G") if view.tuner == "ei" else ObjectiveWords("objective (larger is better)", "objective", factor=-1.0)
+
+
+def metrics_of_study(view: StudyView) -> dict[str, MetricWords]:
+    """Every figure of merit that some trial has a number for; the others, such as a time that none reached, would be rows of dashes."""
+    told = dict.fromkeys(n for t in view.trials if t.score is not None for n, value in t.score.metrics.items() if value is not None)
+    out = {name: MetricWords(*metric_words(name)) for name in told}
+    if "objective_worst" in out:
+        # An objective as it is stored, which is told as the mean over the plants is.
+        words = objective_of_study(view)
+        out["objective_worst"] = MetricWords(f"{words.short}, worst plant", words.unit, -words.factor)
+    return out

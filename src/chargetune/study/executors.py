@@ -15,6 +15,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from types import FrameType, TracebackType
 from typing import ParamSpec, TypeVar
 
+from chargetune.runtime.counted import counted
 from chargetune.runtime.notes import say_warnings_as_notes
 
 __all__ = ["ProcessExecutor", "bounded_workers", "process_executor"]
@@ -99,10 +100,11 @@ class ProcessExecutor(Executor):
             self.kill()
 
 
-def bounded_workers(wanted: int, work: int | None = None, what: str = "trials") -> tuple[int, str]:
+def bounded_workers(wanted: int, work: int | None = None, what: tuple[str, str] = ("trial", "trials")) -> tuple[int, str]:
     """So many workers as can have something to do, and what to say where that is fewer than are wanted, else nothing.
 
-    Each needs a core of this machine, and one of ``work`` pieces, called ``what``. Raises ValueError for fewer than one.
+    Each needs a core of this machine, and one of ``work`` pieces, called ``what`` (of one, of several).
+    Raises ValueError for fewer than one.
     """
     if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
         raise ValueError(f"workers = {wanted!r}, allowed is an integer >= 1")
@@ -110,11 +112,11 @@ def bounded_workers(wanted: int, work: int | None = None, what: str = "trials") 
     count = max(1, min(wanted, cores, wanted if work is None else work))
     if count == wanted:
         return count, ""
-    reason = f"this machine has {_count(cores, 'cores')}" if count == cores else f"{_count(work or 0, what)} to run"
+    reason = f"this machine has {counted(cores, 'core')}" if count == cores else f"{counted(work or 0, *what)} to run"
     return count, f"workers = {wanted} lowered to {count}: {reason}"
 
 
-def process_executor(workers: int, work: int | None = None, what: str = "trials") -> ProcessExecutor:
+def process_executor(workers: int, work: int | None = None, what: tuple[str, str] = ("trial", "trials")) -> ProcessExecutor:
     """An executor with ``workers`` fresh processes, one thread of linear algebra each; not more than `bounded_workers`.
 
     Fresh (spawned) processes share no locks or threads with this one. They ignore Ctrl-C, which is for the process that
@@ -132,10 +134,6 @@ def _cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:
         return os.cpu_count() or 1
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what.removesuffix('s') if number == 1 else what}"
 
 
 def _one_process() -> ProcessPoolExecutor:

@@ -44,7 +44,7 @@ def progress_bar(known: Iterable[Trial], trials: int) -> Iterator[Progress]:
 
         def show(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
             best = "none" if incumbent is None or incumbent.score is None else f"{incumbent.score.objective:.4g}"
-            bar.set_postfix_str(f"best {best}, {violating} violating, {failures} failed", refresh=False)
+            bar.set_postfix_str(f"best {best}, {violating} over, {failures} failed", refresh=False)
             bar.update()
 
         yield show

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from chargetune.plants.plant import SetUpError
+from chargetune.runtime.counted import counted
 from chargetune.study.evaluation import Evaluate, Outcome, evaluate_trial
 from chargetune.study.executors import ProcessExecutor
 from chargetune.study.trial import Trial
@@ -125,7 +126,7 @@ def _outcomes_here(
 def lost(times: int, error: BaseException | None = None) -> str:
     """The ending of a trial that lost so many workers."""
     reason = "" if error is None else f" ({type(error).__name__}: {error})"
-    return f"lost: each of {times} attempts ended with the process that evaluated it{reason}"
+    return f"lost: each of {counted(times, 'attempt')} ended with the process that evaluated it{reason}"
 
 
 def _evaluate(evaluate: Evaluate, trial: Trial, times: int) -> Outcome:  # noqa: ARG001 - Dask takes equal arguments for the same call

@@ -39,7 +39,7 @@ REFUSED = [
     ("soc", tuple(100 * z for z in NINE), ("soc[0] = 10", "0..1", "not per cent")),
     ("soc", changed(NINE, 3, 0.3), ("soc[3] = 0.3 must be more than soc[2] = 0.3",)),
     ("soc", NINE[::-1], ("soc[1] = 0.8 must be more than soc[0] = 0.9",)),
-    ("soc", (0.5,), ("soc has 1 values", "at least 2")),
+    ("soc", (0.5,), ("soc has 1 value", "at least 2")),
     ("soc", NINE[:8], ("R0_ohm has 9 values, expected 8",)),
     ("soc", changed(NINE, 2, NAN), ("soc[2] = nan", "finite")),
     ("soc", changed(NINE, 2, "0,3"), ("soc[2] = '0,3'", "finite number")),

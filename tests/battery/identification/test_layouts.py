@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from chargetune.battery.identification.cycler_files import Reading, read_record
-from chargetune.battery.identification.headings import columns_of, missing
-from chargetune.battery.identification.layouts import LAYOUTS
+from chargetune.battery.identification.headings import columns_of, missing, unit_of
+from chargetune.battery.identification.layouts import CLOCKS, LAYOUTS, SHORT_UNITS, UNITS
+from chargetune.battery.identification.open_circuit import ocv_from_slow
+from chargetune.battery.identification.pulse_fit import identify
+from chargetune.battery.identification.record import assumptions_told
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 from cycler_files import VARIANTS, pulse_test, write
@@ -94,7 +97,12 @@ TWO_WAYS = {
     "h:mm or mm:ss": ("Time,Current(A),Voltage(V)", clock("{mm}:{s:06.3f}"), {}, "two parts can be hh:mm or mm:ss .*--time-unit"),
     "days or ms": ("Time,Current(A),Voltage(V)", clock("{d}:{h}:{m}:{s:02.0f}"), {}, "four parts can be .*--time-unit"),
     "A or mA": ("Time/s,Current,Voltage/V", plain(1, 3), {"current": 1e3}, "Current has no unit and reaches 3000.*--current-unit"),
-    "ms taken for s": ("Time,Current/A,Voltage/V", plain(1e3, 0), {}, "gap of 1000 s.*Time has no unit: s was assumed .--time-unit"),
+    "ms taken for s": (
+        "Time,Current/A,Voltage/V",
+        plain(1e3, 0),
+        {},
+        "gap of 1000 s.*no unit: s was assumed, up to .* s .--time-unit",
+    ),
     "no sign": ("Time/s,Current/A,Voltage/V", plain(1, 3), {"unsigned": True}, "rises in 3 of 9 stretches.*--sign unsigned"),
     "another unit": (
         "Time/s,Current/A,Voltage/kV",
@@ -124,6 +132,28 @@ def test_what_was_assumed_is_among_the_remarks(tmp_path):
 def test_an_unknown_option_is_refused(option, allowed):
     with pytest.raises(ValueError, match=f"{next(iter(option))} = .*allowed are .*{allowed}"):
         Reading(**option)
+
+
+@pytest.mark.parametrize(("name", "units"), [("time_unit", (*SHORT_UNITS["time"], *CLOCKS)), ("current_unit", SHORT_UNITS["current"])])
+def test_every_unit_is_listed_where_one_is_refused_and_is_accepted(name, units):
+    with pytest.raises(ValueError, match=f"allowed are {', '.join(units[:-1])} and {units[-1]}$"):
+        Reading(**{name: "lightyear"})
+    for unit in units:
+        assert getattr(Reading(**{name: unit}), name) == unit
+    # One short name for each factor.
+    quantity = name.removesuffix("_unit")
+    assert sorted(UNITS[quantity][unit_of(u)] for u in SHORT_UNITS[quantity]) == sorted({*UNITS[quantity].values()})
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("d", 86400.0)])
+def test_hours_taken_for_seconds_are_refused_with_the_option_that_decides(unit, seconds, tmp_path):
+    path = table(tmp_path, "Time,Current/A,Voltage/V", plain(1 / seconds, 10))
+    with pytest.raises(ValueError, match=r"0 sets of pulses .*Time has no unit: s was assumed, up to .* s \(--time-unit decides\)$"):
+        identify(read_record(path))
+    assert read_record(path, Reading(time_unit=unit)).time_s[-1] == pytest.approx(np.ptp(pulse_test().time))
+    slow = read_record(path)
+    with pytest.raises(ValueError, match=r"passes .* Ah.*Time has no unit.*--time-unit decides"), assumptions_told(slow):
+        ocv_from_slow(slow, 3.0, [])
 
 
 def test_dates_that_disagree_with_a_clock_without_unit_are_refused(tmp_path):

@@ -31,7 +31,7 @@ def test_a_rest_lasts_until_its_current_began():
     np.testing.assert_allclose(found.voltage_V, [3.6, 3.6, 3.6, 3.5, 3.49, 3.55])
     np.testing.assert_allclose(found.temperature_K, [298, 299, 299, 300, 301, 302])
     assert found.charge_Ah[-1] == pytest.approx(-2.0 / 3600)
-    assert found.remarks == ("1 rests have no sample at their end; each was taken to last until its current began",)
+    assert found.remarks == ("no sample at the end of 1 rest; each was taken to last until its current began",)
 
 
 def test_a_rest_with_its_end_is_left_alone():
@@ -45,7 +45,7 @@ def test_a_rest_with_its_end_is_left_alone():
     ("rows", "said"),
     [
         ([(0, 0, 3.6), (10, 1, 3.7), (9, 1, 3.7)], r"mine, sample 3: time_s = 9 after 10"),
-        ([(0, 0, 3.6), (10, np.nan, 3.7)], r"mine: current_A .* allowed are 2 finite numbers"),
+        ([(0, 0, 3.6), (10, np.nan, 3.7)], r"mine: current_A .* allowed: 2 finite numbers"),
     ],
 )
 def test_a_record_that_is_none_is_refused(rows, said):
@@ -54,5 +54,5 @@ def test_a_record_that_is_none_is_refused(rows, said):
 
 
 def test_arrays_of_two_lengths_are_refused():
-    with pytest.raises(ValueError, match=r"voltage_V of shape \(2,\), allowed are 3"):
+    with pytest.raises(ValueError, match=r"voltage_V of shape \(2,\), allowed: 3"):
         Record("mine", np.arange(3.0), np.ones(3), np.ones(2))

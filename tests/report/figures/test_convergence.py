@@ -91,7 +91,7 @@ def test_marks_say_what_became_of_each_trial():
     shown = {line.get_label(): line for line in upper.lines}
     for label, marker, color, numbers, values in (
         ("within limits", "o", GREEN, [1, 4, 5], [-4.0, -2.0, -2.5]),
-        ("violating", "^", RED, [0, 3], [-1.0, -3.0]),
+        ("over a limit", "^", RED, [0, 3], [-1.0, -3.0]),
         ("untuned", "s", BLUE, [0], [-1.0]),
         ("tuned", "o", ORANGE, [4], [-2.0]),
     ):
@@ -101,12 +101,12 @@ def test_marks_say_what_became_of_each_trial():
         assert list(shown[label].get_ydata()) == values
     below = {line.get_label(): line for line in lower.lines}
     assert list(below["within limits"].get_ydata()) == [0.4, 0.0, -1.0]
-    assert list(below["violating"].get_ydata()) == [5.0, 0.6]
+    assert list(below["over a limit"].get_ydata()) == [5.0, 0.6]
     assert list(below["limit"].get_ydata()) == [0.0, 0.0]
     assert list(below["tolerance"].get_ydata()) == [0.5, 0.5]
     assert list(shown["failed"].get_xdata()) == [2]
     assert shown["failed"].get_marker() == "x"
-    assert legend(figure) == ["within limits", "violating", "untuned", "tuned", "failed", "best so far", "limit", "tolerance"]
+    assert legend(figure) == ["within limits", "over a limit", "untuned", "tuned", "failed", "best so far", "limit", "tolerance"]
     labels = [axis.get_ylabel().replace("\n", " ") for axis in (upper, lower)]
     assert [*labels, lower.get_xlabel()] == ["objective (larger is better)", "speed beyond its limit", "trial"]
     # The first and the last trial stand within the axis.
@@ -163,7 +163,7 @@ def test_no_feasible_trial_leaves_no_incumbent(stores):
     view = read_study(stores["violating"], "charge")
     figure = convergence_figure(view)
     assert np.isnan(incumbents(view)).all()
-    assert legend(figure) == ["violating", "untuned", "tuned, violating", "best possible", "limit", "tolerance"]
+    assert legend(figure) == ["over a limit", "untuned", "tuned, over a limit", "best possible", "limit", "tolerance"]
 
 
 def test_tolerances_that_differ_have_no_common_line():

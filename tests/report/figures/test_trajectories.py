@@ -63,12 +63,12 @@ def test_legend_names_what_is_drawn(stores):
     said = {kind: legend(trajectories_figure(read_study(stores[kind], "charge"))) for kind in ("mixed", "violating")}
     number = read_study(stores["violating"], "charge").tuned.number
     assert said["mixed"] == ["trials", "untuned", "tuned (trial 8)", "limit"]
-    assert said["violating"] == ["trials", "untuned", f"tuned, violating (trial {number})", "limit"]
+    assert said["violating"] == ["trials", "untuned", f"tuned, over a limit (trial {number})", "limit"]
 
 
 def test_untuned_run_shows_through_when_it_is_the_tuned_one_too(stores):
     figure = trajectories_figure(read_study(stores["mixed"], "charge", trials=1))
-    assert legend(figure) == ["untuned", "tuned, violating (trial 0)", "limit"]
+    assert legend(figure) == ["untuned", "tuned, over a limit (trial 0)", "limit"]
     for axis in figure.axes:
         assert [lines(axis, color)[0].get_linestyle() for color in (BLUE, ORANGE)] == ["-", "--"]
 

@@ -119,8 +119,8 @@ def test_untuned_run_shows_through_when_it_is_the_tuned_one_too(stores):
 
 def test_a_violating_result_is_called_so(stores):
     view = read_study(stores["violating"], "charge")
-    assert "tuned, violating" in legend(backoff_figure(view))
-    assert "tuned, violating" in legend(resistance_figure(view, "R0"))
+    assert "tuned, over a limit" in legend(backoff_figure(view))
+    assert "tuned, over a limit" in legend(resistance_figure(view, "R0"))
 
 
 def test_what_is_not_tuned_is_refused(stores):

@@ -133,7 +133,7 @@ def test_damaged_trace_is_named(tmp_path):
     change(path, "UPDATE trace SET data = substr(data, 1, 200) WHERE number = 5")
     text = sections(parsed(report_page(read_study(path, "charge"), evaluate=False)))
     assert "trace of trial 5 is damaged" in text
-    assert "9 trials with a trace were judged again; every stored excess is what its trace says" in text
+    assert "Judged again: 9 trials with a trace; every stored excess is what its trace says" in text
 
 
 def test_numbers_and_missing_values_in_a_table():

@@ -54,6 +54,15 @@ def test_head_names_limits_and_theta(view):
     assert head["metrics"]["t80_min"] == ["time to 80 % SOC", "min"]
 
 
+def test_a_figure_of_merit_that_no_trial_has_is_left_out_and_the_worst_objective_is_in_its_unit(view):
+    told = {"t80_min": None, "t99_min": None, "objective_worst": -0.5}
+    trials = [replace(t, score=replace(t.score, metrics=told)) for t in view.trials if t.score is not None]
+    timed = replace(view, trials=trials, problem=changed(view.problem, charge_time_to_soc=0.8))
+    minutes = timed.problem.episode.steps * timed.problem.controller.sampling_time_s / 60
+    assert study_head(timed)["metrics"] == {"objective_worst": ["t80, worst plant", "min"]}
+    assert trial_rows(timed, trials)[0]["metrics"] == {"objective_worst": pytest.approx(0.5 * minutes)}
+
+
 def test_the_loss_is_named_by_what_is_minimised(view):
     timed = changed(view.problem, charge_time_to_soc=0.8)
     views = [view, replace(view, tuner="ei"), replace(view, problem=timed), replace(view, problem=None)]

@@ -18,6 +18,7 @@ from pydantic import Field
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.validation import check_count
+from chargetune.runtime.counted import counted
 
 __all__ = [
     "CAPACITY_MAX_AH",
@@ -158,7 +159,7 @@ class Cell:
         for name in self.tables:
             values = getattr(self, name)
             if len(values) != len(self.soc):
-                raise ValueError(f"cell: {name} has {len(values)} values, expected {len(self.soc)}, one for each entry of soc")
+                raise ValueError(f"cell: {name} has {counted(len(values), 'value')}, expected {len(self.soc)}, one for each entry of soc")
             if name.startswith("C"):
                 self._check_time_constants(name)
             else:
@@ -186,7 +187,9 @@ class Cell:
         if self.ocv_soc[0] > 0.0 or self.ocv_soc[-1] < 1.0:
             raise ValueError(f"cell: ocv_soc = {self.ocv_soc[0]:g}..{self.ocv_soc[-1]:g} must cover 0..1")
         if len(self.ocv_V) != len(self.ocv_soc):
-            raise ValueError(f"cell: ocv_V has {len(self.ocv_V)} values, expected {len(self.ocv_soc)}, one for each entry of ocv_soc")
+            raise ValueError(
+                f"cell: ocv_V has {counted(len(self.ocv_V), 'value')}, expected {len(self.ocv_soc)}, one for each entry of ocv_soc"
+            )
         since = 0
         for i, (low, high) in enumerate(pairwise(self.ocv_V), start=1):
             if high < low:
@@ -329,7 +332,7 @@ def _within(name: str, value: float, low: float, high: float, unit: str, hint: s
 
 def _soc_table(name: str, values: tuple[float, ...], least: int) -> None:
     if len(values) < least:
-        raise ValueError(f"cell: {name} has {len(values)} values, expected at least {least}")
+        raise ValueError(f"cell: {name} has {counted(len(values), 'value')}, expected at least {least}")
     for i, value in enumerate(values):
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"cell: {name}[{i}] = {value:g}, allowed is 0..1 (a fraction, not per cent)")

@@ -11,6 +11,7 @@ import casadi as ca
 from pydantic import Field
 
 from chargetune.model.splines import pchip
+from chargetune.runtime.counted import counted
 
 __all__ = ["GAS_CONSTANT", "Thermal"]
 
@@ -63,7 +64,8 @@ class Thermal:
                 raise ValueError(f"thermal: {name} = {value!r}, allowed is [-{most:g}, {most:g}] {unit}")
         if len(self.factor) != len(self.factor_K) or len(self.factor) == 1:
             raise ValueError(
-                f"thermal: factor has {len(self.factor)} values for {len(self.factor_K)} temperatures, allowed are as many, at least 2"
+                f"thermal: factor has {counted(len(self.factor), 'value')} for {counted(len(self.factor_K), 'temperature')}, "
+                "allowed are as many, at least 2"
             )
         if self.factor and self.activation_J_mol:
             raise ValueError("thermal: activation_J_mol and factor are given; allowed is one of them")

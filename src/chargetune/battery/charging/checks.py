@@ -20,6 +20,7 @@ from chargetune.checks.plant_response import check_response
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.stepwise import run_episode
 from chargetune.plants.simulated import SimulatedPlant
+from chargetune.runtime.counted import counted
 
 __all__ = ["check_charging"]
 
@@ -98,7 +99,9 @@ def _target(problem: ChargingProblem) -> list[Finding]:
     elif most < target - MISSED_SOC:
         message = f"soc_target = {target:g} cannot be reached in {60 * hours:.3g} min: the largest current charges to {most:.3f}"
         needed = (target - problem.episode.soc_start) * cell.capacity_Ah / cell.coulombic_efficiency / problem.current_max_A * 3600
-        remedy = f"at least {int(np.ceil(needed / problem.controller.sampling_time_s))} steps, or soc_target of at most {most:.3f}"
+        remedy = (
+            f"at least {counted(int(np.ceil(needed / problem.controller.sampling_time_s)), 'step')}, or soc_target of at most {most:.3f}"
+        )
     elif not reached >= target - MISSED_SOC:
         message = f"soc_target = {target:g}: a controller that knows the cell only gets to {reached:.3f} in {60 * hours:.3g} min"
         remedy = "more steps, a lower soc_target, or wider limits"

@@ -69,9 +69,9 @@ class ChargingProblem:
         except TypeError as error:
             raise ValueError(f"plant = {self.plant!r}, allowed is data that can be hashed, such as a frozen dataclass: {error}") from error
         if self.objective.charge_time_to_soc is not None:
-            most = self.episode.soc_target
-            check_number("charge_time_to_soc", self.objective.charge_time_to_soc, self.episode.soc_start, most, "", open_low=True)
-        check_count("verdict_samples", self.objective.verdict_samples, 1, self.episode.steps)
+            start, most, span = self.episode.soc_start, self.episode.soc_target, "from episode.soc_start to soc_target"
+            check_number("objective.charge_time_to_soc", self.objective.charge_time_to_soc, start, most, span, open_low=True)
+        check_count("objective.verdict_samples", self.objective.verdict_samples, 1, self.episode.steps)
         believed = self.episode.soc_start + self.estimator.soc_start_error
         check_number("believed SOC at the start (soc_start + soc_start_error)", believed, 0.0, 1.0)
         self._check_bounds()
@@ -82,14 +82,16 @@ class ChargingProblem:
     def _check_bounds(self) -> None:
         cell = self.cell
         each = " per cell of the pack" if cell.pack_line else ""
-        least = check_number("current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, f"A{each}")
-        most = check_number("current_max_A", self.current_max_A, 0.0, cell.current_max_A, f"A{each}", open_low=True)
-        highest = check_number("voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}", open_low=True)
-        lowest = check_number("voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}")
+        least = check_number("limits.current_min_A", self.limits.current_min_A, -cell.current_max_A, cell.current_max_A, f"A{each}")
+        most = check_number("limits.current_max_A", self.current_max_A, 0.0, cell.current_max_A, f"A{each}", open_low=True)
+        highest = check_number(
+            "limits.voltage_max_V", self.voltage_max_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}", open_low=True
+        )
+        lowest = check_number("limits.voltage_min_V", self.voltage_min_V, cell.voltage_min_V, cell.voltage_max_V, f"V{each}")
         if least >= most:
-            raise ValueError(f"current_min_A = {least:g} must be less than current_max_A = {most:g}")
+            raise ValueError(f"limits.current_min_A = {least:g} must be less than current_max_A = {most:g}")
         if lowest >= highest:
-            raise ValueError(f"voltage_min_V = {lowest:g} must be less than voltage_max_V = {highest:g}")
+            raise ValueError(f"limits.voltage_min_V = {lowest:g} must be less than voltage_max_V = {highest:g}")
         if self.plant is None:
             known = {"voltage": True, "temperature": cell.thermal is not None, "anode": cell.anode is not None}
             missing = [limit.name for limit in self.limits_by_name.values() if not known[limit.of]]

@@ -12,6 +12,7 @@ from scipy.optimize import lsq_linear
 from chargetune.battery.cell.cell import Cell
 from chargetune.battery.cell.plating import Anode
 from chargetune.episode.episode import Episode
+from chargetune.runtime.counted import counted
 
 __all__ = ["with_anode"]
 
@@ -54,7 +55,8 @@ def with_anode(cell: Cell, charges: Sequence[Episode], nodes: int = NODES) -> Ce
     largest = [float(np.max(part[:, 1])) for part in columns if len(part)]
     if not largest or max(largest) <= 0 or min(largest) > (1 - APART) * max(largest):
         raise ValueError(
-            f"largest currents of the {len(columns)} charges (times the resistance factor): {', '.join(f'{v:.3g}' for v in largest)} A; "
+            f"largest currents of the {counted(len(columns), 'charge')} (times the resistance factor): "
+            f"{', '.join(f'{v:.3g}' for v in largest)} A; "
             f"to tell potential from resistance in [anode] one charge needs at most {1 - APART:.1f} of another's"
         )
     at = np.linspace(float(z.min()), float(z.max()), nodes)

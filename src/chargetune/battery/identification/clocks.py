@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.identification.record import JUMP_SHARE
+from chargetune.runtime.counted import counted
 
 __all__ = ["DAY_S", "Clock", "elapsed"]
 
@@ -69,12 +70,14 @@ def elapsed(name: str, clock: Clock, remarks: list[str]) -> tuple[NDArray[np.flo
         steps[begins] = time[begins + 1]
     if falls.size:
         kind = "once a step" if of_steps else f"first at sample {at[falls[0] + 1] + 1}"
-        remarks.append(f"the clock restarts {begins.size} times ({kind}); the steps were strung together")
+        remarks.append(f"the clock restarts {counted(begins.size, 'time')} ({kind}); the steps were strung together")
     stands = steps == 0
     stands[begins] = False
     if np.mean(stands) > STANDS_SHARE:
         k = int(np.argmax(stands))
-        raise ValueError(f"{name}, sample {k + 2}: time stands at {time[k]:g} s in {np.sum(stands)} samples, allowed is an increasing time")
+        raise ValueError(
+            f"{name}, sample {k + 2}: time stands at {time[k]:g} s in {counted(np.sum(stands), 'sample')}, allowed is an increasing time"
+        )
     return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]), dtype=np.float64), keep
 
 

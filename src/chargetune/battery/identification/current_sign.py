@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.identification.record import JUMP_SHARE, Record, segments
+from chargetune.runtime.counted import counted
 
 __all__ = ["Sign", "signed_by_state", "with_sign"]
 
@@ -102,7 +103,9 @@ def _discharge_positive(record: Record) -> bool:
     products = (change * answer)[large]
     up, down = float(np.sum(products[products > 0])), -float(np.sum(products[products < 0]))
     if min(up, down) > DOUBT_SHARE * (up + down):
-        raise _unsigned(record, f"the voltage rises with the current in {np.sum(products > 0)} jumps and falls in {np.sum(products < 0)}")
+        raise _unsigned(
+            record, f"the voltage rises with the current in {counted(np.sum(products > 0), 'jump')} and falls in {np.sum(products < 0)}"
+        )
     return down > up
 
 
@@ -118,7 +121,8 @@ def _one_sided(record: Record) -> Record:
         raise _unsigned(
             record,
             f"it is never {'negative' if np.max(record.current_A) > record.rest_A else 'positive'}, but the voltage "
-            f"{'rises' if volts > 0 else 'falls'} in {len(contrary)} of {len(answers)} stretches (first at {record.time_s[first]:.0f} s)",
+            f"{'rises' if volts > 0 else 'falls'} in {len(contrary)} of {counted(len(answers), 'stretch', 'stretches')} "
+            f"(first at {record.time_s[first]:.0f} s)",
         )
     return _turned(record, "current was positive when discharging; its sign was changed") if down else record
 

@@ -20,16 +20,15 @@ from chargetune.battery.identification.cells import clock_seconds, dates, decima
 from chargetune.battery.identification.clocks import DAY_S, Clock, elapsed
 from chargetune.battery.identification.current_sign import Sign, signed_by_state
 from chargetune.battery.identification.headings import WAYS, Column, unit_of
-from chargetune.battery.identification.layouts import NEEDED, UNITS
+from chargetune.battery.identification.layouts import CLOCKS, NEEDED, SHORT_UNITS, UNITS
 from chargetune.battery.identification.plausibility import checked
 from chargetune.battery.identification.record import Record
 from chargetune.battery.identification.samples import Samples, read_samples
 from chargetune.battery.validation import check_count
+from chargetune.runtime.counted import counted
 
 __all__ = ["Reading", "read_record"]
 
-# Clocks that can be read in two ways.
-CLOCKS = ("hh:mm", "mm:ss", "d:hh:mm:ss", "hh:mm:ss:ms")
 ZERO_CELSIUS_K = 273.15
 # A temperature column beyond these, degree Celsius, is no cell's; one without a unit that stays within the others is in kelvin.
 CELSIUS_RANGE, KELVIN_RANGE = (-80.0, 200.0), (223.0, 400.0)
@@ -45,7 +44,7 @@ DATES_SHARE, DATES_READ = 0.02, 200
 
 @dataclass(frozen=True)
 class Reading:
-    """What a file leaves open: ``sign`` of its current, ``time_unit`` (s, ms, min, h, hh:mm, mm:ss), ``current_unit`` (A, mA).
+    """What a file leaves open: ``sign`` of its current, ``time_unit`` and ``current_unit`` (any name in `UNITS`, or one of `CLOCKS`).
 
     ``series`` and ``parallel``: it was measured on a pack of so many cells, and the record is that of one of them.
     """
@@ -62,10 +61,10 @@ class Reading:
         for count in PACK:
             check_count(count, getattr(self, count), 1, PACK_MAX)
         for name, quantity in (("time_unit", "time"), ("current_unit", "current")):
-            unit = getattr(self, name)
-            if unit is not None and unit_of(unit) not in ({*UNITS[quantity], *CLOCKS} if quantity == "time" else {*UNITS[quantity]}) - {""}:
-                allowed = "s, ms, min, h, d, hh:mm, mm:ss, d:hh:mm:ss and hh:mm:ss:ms" if quantity == "time" else "A, mA and uA"
-                raise ValueError(f"{name} = {unit!r}, allowed are {allowed}")
+            unit, clocks = getattr(self, name), list(CLOCKS if quantity == "time" else ())
+            if unit is not None and unit_of(unit) not in {*UNITS[quantity], *clocks} - {""}:
+                *others, last = [*SHORT_UNITS[quantity], *clocks]
+                raise ValueError(f"{name} = {unit!r}, allowed are {', '.join(others)} and {last}")
 
 
 def read_record(path: str | Path, reading: Reading | None = None) -> Record:
@@ -103,7 +102,7 @@ def read_record(path: str | Path, reading: Reading | None = None) -> Record:
     raw, of_day = _time(samples, columns[source], mark, assumed, remarks)
     current = arrays["current"]
     if len(current) < 2:
-        raise ValueError(f"{name} has {len(current)} rows of numbers, allowed are at least 2")
+        raise ValueError(f"{name} has {counted(len(current), 'row')} of numbers, allowed are at least 2")
     known = both
     if "state" in columns and options.sign is None and not both:
         signed = signed_by_state(name, current, samples.cells["state"], remarks)
@@ -199,7 +198,7 @@ def _time(samples: Samples, column: Column, mark: str, assumed: list[str], remar
         except ValueError as error:
             raise ValueError(f"{samples.name}, row {row}: {column.heading} = {cell!r}, allowed is {error}") from None
     if not column.unit and clocks < len(values):
-        assumed.append(f"{column.heading} has no unit: s was assumed (--time-unit decides)")
+        assumed.append(f"{column.heading} has no unit: s was assumed, up to {max(values):.4g} s (--time-unit decides)")
     return np.array(values), clocks == len(values)
 
 

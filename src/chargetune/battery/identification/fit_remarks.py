@@ -11,6 +11,7 @@ from scipy.ndimage import median_filter
 from chargetune.battery.identification.circuit_fit import PulseFit
 from chargetune.battery.identification.record import Record
 from chargetune.battery.identification.spikes import LONGEST, spikes
+from chargetune.runtime.counted import counted
 
 __all__ = ["remarks_on", "without_spikes"]
 
@@ -32,7 +33,8 @@ def remarks_on(fits: Sequence[PulseFit]) -> list[str]:
     off = [fit for fit in fits if fit.level_off_V]
     if off:
         worst = 1e3 * max(abs(fit.level_off_V) for fit in off)
-        which = f"all {len(fits)} sets" if len(off) == len(fits) else f"{len(off)} of {len(fits)} sets ({_listed(off)})"
+        every = counted(len(fits), "set")
+        which = f"all {every}" if len(off) == len(fits) else f"{len(off)} of {every} ({_listed(off)})"
         more = "" if "R2_ohm" in off[0].values else "; --rc 2 may follow them"
         notes.append(
             f"the circuit does not follow the pulses of {which}: its level there is up to {worst:.1f} mV off the rest before them. "

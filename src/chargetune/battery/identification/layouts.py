@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["LAYOUTS", "NAMES", "NEEDED", "UNITS", "Layout"]
+__all__ = ["CLOCKS", "LAYOUTS", "NAMES", "NEEDED", "SHORT_UNITS", "UNITS", "Layout"]
 
 NEEDED = ("time", "current", "voltage")
 
@@ -176,5 +176,9 @@ UNITS: dict[str, dict[str, float]] = {
     "temperature": {"": 1.0, **dict.fromkeys(("c", "degc", "celsius", "degreec", "oc"), 1.0), "k": 1.0, "kelvin": 1.0, "f": 1.0,
     "degf": 1.0},
 }  # fmt: skip
+# The shortest name of each unit, as a person types it.
+SHORT_UNITS = {"time": ("s", "ms", "us", "min", "h", "d"), "current": ("A", "mA", "uA", "kA")}
+# Clocks that can be read in two ways.
+CLOCKS = ("hh:mm", "mm:ss", "d:hh:mm:ss", "hh:mm:ss:ms")
 UNITS["step_time"], UNITS["counter"] = UNITS["time"], UNITS["voltage"]
 UNITS["charging"] = UNITS["discharging"] = UNITS["current"]

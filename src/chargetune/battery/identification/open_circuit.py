@@ -149,6 +149,7 @@ def ocv_from_slow(
         z = (passed - passed.min()) / (passed.max() - passed.min())
         order = np.argsort(z, kind="stable")
         curves.append((z[order], part.voltage_V[order], np.abs(part.current_A[order])))
+    remarks += [f"{ocv.source}: {remark}" for remark in ocv.remarks]
     grid = np.concatenate([np.linspace(0.0, 0.1, 11), np.linspace(0.15, 0.95, 17), [1.0]])
     (v_c, i_c), (v_d, i_d) = ([np.interp(grid, z, values) for values in (v, i)] for z, v, i in curves)
     between = (v_c * i_d + v_d * i_c) / (i_c + i_d)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.identification.current_sign import Sign, with_sign
 from chargetune.battery.identification.record import Record
+from chargetune.runtime.counted import counted
 
 __all__ = ["checked"]
 
@@ -102,11 +103,11 @@ def _without_offset(record: Record) -> Record:
         return record
     if not same or np.max(spreads) > max(abs(zero), SAME_LEVEL * largest):
         note = (
-            f"the current reads {1e3 * values.min():.3g} to {1e3 * values.max():.3g} mA in its {len(levels)} rests: if that is the "
-            "sensor's zero, the counted charge is wrong"
+            f"the current reads {1e3 * values.min():.3g} to {1e3 * values.max():.3g} mA in its {counted(len(levels), 'rest')}: if that is "
+            "the sensor's zero, the counted charge is wrong"
         )
         return replace(record, remarks=(*record.remarks, note))
-    note = f"the current reads {1e3 * zero:.4g} mA in each of its {len(levels)} rests; it was subtracted from every sample"
+    note = f"the current reads {1e3 * zero:.4g} mA in each of its {counted(len(levels), 'rest')}; it was subtracted from every sample"
     return replace(record, current_A=record.current_A - zero, remarks=(*record.remarks, note))
 
 
@@ -146,5 +147,5 @@ def _with_ends_of_rests(record: Record) -> Record:
         current_A=longer(record.current_A),
         voltage_V=longer(record.voltage_V),
         temperature_K=None if record.temperature_K is None else longer(record.temperature_K),
-        remarks=(*record.remarks, f"{late.size} rests have no sample at their end; each was taken to last until its current began"),
+        remarks=(*record.remarks, f"no sample at the end of {counted(late.size, 'rest')}; each was taken to last until its current began"),
     )

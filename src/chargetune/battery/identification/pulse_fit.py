@@ -29,8 +29,9 @@ from chargetune.battery.identification.pulses import (
     set_temperatures,
     unused_pulses,
 )
-from chargetune.battery.identification.record import Record, segments
+from chargetune.battery.identification.record import Record, assumptions_told, segments
 from chargetune.battery.validation import check_number
+from chargetune.runtime.counted import counted
 
 __all__ = ["SETS_MIN", "Identification", "PulseFit", "cell_toml", "identify", "predicted_voltage"]
 
@@ -68,17 +69,29 @@ def identify(
     several temperatures ``temperature_C`` says which sets are used. A set whose fit the data do not hold is left out, and
     the remarks say so. Raises ValueError that says which parameter the data do not hold at any SOC, or the temperatures.
     """
-    began = time.perf_counter()
     if rc not in {1, 2}:
         raise ValueError(f"rc = {rc!r}, allowed is 1 or 2")
     if branch not in {"charge", "discharge", "middle"}:
         raise ValueError(f"branch = {branch!r}, allowed are charge, discharge and middle")
+    with assumptions_told(record):
+        return _identified(record, rc, capacity_Ah, ocv, name, temperature_C, branch)
+
+
+def _identified(
+    record: Record,
+    rc: Literal[1, 2],
+    capacity_Ah: float | None,
+    ocv: Record | None,
+    name: str,
+    temperature_C: float | None,
+    branch: Branch,
+) -> Identification:
+    began = time.perf_counter()
     every = find_pulse_sets(record)
     if len(every) < SETS_MIN:
-        assumed = [f"; {remark}" for remark in record.remarks if "time-unit" in remark]
         raise ValueError(
-            f"{record.source}: {len(every)} sets of pulses after a rest; to identify R0, R1 and C1 over SOC at least {SETS_MIN} are needed "
-            f"(pulses of at most {PULSE_MAX_S:g} s after rests of at least {REST_MIN_S:g} s){''.join(assumed)}"
+            f"{record.source}: {counted(len(every), 'set')} of pulses after a rest; to identify R0, R1 and C1 over SOC "
+            f"at least {SETS_MIN} are needed (pulses of at most {PULSE_MAX_S:g} s after rests of at least {REST_MIN_S:g} s)"
         )
     remarks = [*record.remarks, "SOC 1 is the fullest point of the record"]
     chosen, within = _at_temperature(record, every, temperature_C, remarks)
@@ -102,9 +115,11 @@ def identify(
     remarks += unused_pulses(record, every, soc)
     sets = [every[k] for k in chosen]
     within[:start] = False
-    grid, volts = (
-        ocv_from_rests(record, sets, soc, remarks, branch, within) if ocv is None else ocv_from_slow(ocv, capacity, remarks, branch)
-    )
+    if ocv is None:
+        grid, volts = ocv_from_rests(record, sets, soc, remarks, branch, within)
+    else:
+        with assumptions_told(ocv):
+            grid, volts = ocv_from_slow(ocv, capacity, remarks, branch)
     curve = PchipInterpolator(grid, volts, extrapolate=True)
     fits, unfit = list[PulseFit](), list[ValueError]()
     for k in chosen:
@@ -113,7 +128,7 @@ def identify(
         except ValueError as error:
             unfit.append(error)
     if len(fits) < SETS_MIN:
-        more = f" ({len(unfit)} of {len(chosen)} sets are unfit)" if fits else ""
+        more = f" (unfit: {len(unfit)} of {counted(len(chosen), 'set')})" if fits else ""
         raise ValueError(f"{unfit[0]}{more}")
     remarks += [f"left out: {str(error).replace(f' of {record.source}', '')}" for error in unfit]
     remarks += remarks_on(fits)
@@ -140,17 +155,18 @@ def _at_temperature(
     shown = ", ".join(f"{level:g}" for level, _ in levels)
     if temperature_C is None and len(levels) > 1:
         raise ValueError(
-            f"{record.source}: pulses at {len(levels)} temperatures, {shown} degC; --temperature says which of them the cell is for"
+            f"{record.source}: pulses at {counted(len(levels), 'temperature')}, {shown} degC; --temperature says "
+            "which of them the cell is for"
         )
     near = [(level, chosen) for level, chosen in levels if temperature_C is None or abs(level - temperature_C) <= TEMPERATURES_APART_K]
     if not near:
         raise ValueError(f"{record.source}: temperature_C = {temperature_C:g}, allowed are those of its pulses, {shown} degC")
     level, chosen = min(near, key=lambda pair: abs(pair[0] - (temperature_C or pair[0])))
     if len(chosen) < SETS_MIN:
-        raise ValueError(f"{record.source}: {len(chosen)} sets of pulses at {level:g} degC, needed are at least {SETS_MIN}")
+        raise ValueError(f"{record.source}: {counted(len(chosen), 'set')} of pulses at {level:g} degC, needed are at least {SETS_MIN}")
     if len(levels) == 1:
         return chosen, np.ones(len(record), dtype=bool)
-    remarks.append(f"temperature {level:g} degC: {len(chosen)} of {len(sets)} sets of pulses (the record has {shown} degC)")
+    remarks.append(f"temperature {level:g} degC: {len(chosen)} of {counted(len(sets), 'set')} of pulses (the record has {shown} degC)")
     off = record.temperature_K - ZERO_CELSIUS_K - level
     return chosen, np.asarray(np.abs(off) <= TEMPERATURES_APART_K)
 
@@ -174,7 +190,7 @@ def _cell(
     worst = 1e3 * max(fit.rms_V for fit in fits)
     volts = without_spikes(record)[within]
     highest, lowest = float(np.max(volts)), float(np.min(volts))
-    made = f"Identified from the pulses in {record.source}: {len(near)} SOC points, {rc}-RC, rms at most {worst:.2f} mV."
+    made = f"Identified from the pulses in {record.source}: {counted(len(near), 'SOC point')}, {rc}-RC, rms at most {worst:.2f} mV."
     return Cell(
         name=name,
         capacity_Ah=round(capacity, 6),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.battery.identification.record import Record, segments
+from chargetune.runtime.counted import counted
 
 __all__ = ["PULSE_MAX_S", "REST_MIN_S", "PulseSet", "find_pulse_sets", "groups", "rest_level", "set_temperatures", "unused_pulses"]
 
@@ -89,7 +90,8 @@ def unused_pulses(record: Record, sets: list[PulseSet], soc: NDArray[np.float64]
     if len(long) >= LONG_PULSES:
         at = ", ".join(f"{z:.2f}" for z, _ in long)
         notes.append(
-            f"{len(long)} currents of up to {max(s for _, s in long):.0f} s (SOC {at}) are no pulses, which last {PULSE_MAX_S:g} s at most"
+            f"{counted(len(long), 'current')} of up to {max(s for _, s in long):.0f} s (SOC {at}) are no pulses, "
+            f"which last {PULSE_MAX_S:g} s at most"
         )
     return notes
 

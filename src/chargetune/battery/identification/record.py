@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["JUMP_SHARE", "Record", "segments"]
+from chargetune.runtime.counted import counted
+
+__all__ = ["JUMP_SHARE", "Record", "assumptions_told", "segments"]
 
 # Below this share of the largest current a cell rests.
 REST_SHARE = 0.02
@@ -35,7 +39,9 @@ class Record:
             if (values := getattr(self, name)) is None:
                 continue
             if np.shape(values) != (len(self.time_s),) or not np.all(np.isfinite(values)):
-                raise ValueError(f"{self.source}: {name} of shape {np.shape(values)}, allowed are {len(self.time_s)} finite numbers")
+                raise ValueError(
+                    f"{self.source}: {name} of shape {np.shape(values)}, allowed: {counted(len(self.time_s), 'finite number')}"
+                )
         falls = np.diff(self.time_s) < 0
         if falls.any():
             k = int(np.argmax(falls))
@@ -61,6 +67,18 @@ class Record:
         """Samples ``first`` .. ``last`` (last not included)."""
         warm = None if self.temperature_K is None else self.temperature_K[first:last]
         return Record(self.source, self.time_s[first:last], self.current_A[first:last], self.voltage_V[first:last], warm, self.remarks)
+
+
+@contextmanager
+def assumptions_told(record: Record) -> Iterator[None]:
+    """Within it, what is refused of the record is followed by what was assumed where an option decides: its cause may be there."""
+    try:
+        yield
+    except ValueError as error:
+        assumed = [remark for remark in record.remarks if remark.endswith("decides)")]
+        if type(error) is not ValueError or not assumed or str(error).endswith("decides)"):
+            raise
+        raise ValueError("; ".join([str(error), *assumed])) from error
 
 
 def segments(record: Record) -> list[tuple[int, int, int]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from chargetune.battery.identification.headings import Column, columns_of, missing, units_below
 from chargetune.battery.identification.layouts import UNITS
 from chargetune.battery.identification.tables import Table, tables
+from chargetune.runtime.counted import counted
 
 __all__ = ["Samples", "read_samples"]
 
@@ -88,7 +89,7 @@ def _samples(name: str, table: Table, at: int, columns: dict[str, Column], other
     for count, (number, row) in enumerate(below, start=1):
         if len(row) > width and "".join(row[width:]).strip():
             raise ValueError(
-                f"{name}, row {number} has {len(row)} cells, allowed are {width} as in the header "
+                f"{name}, row {number} has {counted(len(row), 'cell')}, allowed are {width} as in the header "
                 "(decimal commas need semicolons or tabs between columns)"
             )
         if count == len(below) > 1 and len(row) <= max(places) and len(row) < len(below[-2][1]):

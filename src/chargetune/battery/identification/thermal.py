@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 from chargetune.battery.cell.cell import Cell
 from chargetune.battery.cell.thermal import GAS_CONSTANT, Thermal
 from chargetune.battery.identification.record import Record
+from chargetune.runtime.counted import counted
 
 __all__ = ["activation_energy", "with_thermal"]
 
@@ -50,7 +51,7 @@ def with_thermal(cell: Cell, record: Record, soc_start: float, *, activation_J_m
 def activation_energy(cells: Mapping[float, Cell]) -> float:
     """E (J/mol) of Arrhenius' law from cells identified at several temperatures (K): slope of ln(mean R0 + R1) over 1 / (R T)."""
     if len(cells) < 2:
-        raise ValueError(f"cells at {len(cells)} temperatures, needed are at least 2 to identify activation_J_mol")
+        raise ValueError(f"cells at {counted(len(cells), 'temperature')}, needed are at least 2 to identify activation_J_mol")
     inverse = [1 / (GAS_CONSTANT * temperature) for temperature in cells]
     total = [np.log(np.mean(np.add(cell.R0_ohm, cell.R1_ohm))) for cell in cells.values()]
     return float(np.polyfit(inverse, total, 1)[0])

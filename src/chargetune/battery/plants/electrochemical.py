@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -355,6 +356,8 @@ def _parameters(settings: Electrochemical) -> Any:
     why = f" ({OTHER_SETS[name]})" if name in OTHER_SETS else ""
     # A set that PyBaMM got later may run too; its absence from the list is no reason to refuse it.
     if why or name not in list(pybamm.parameter_sets):
+        near = next((known for known in SETS if known.lower() == name.lower()), next(iter(get_close_matches(name, SETS, 1)), None))
+        why = why or (f" (did you mean {near!r}?)" if near else "")
         raise SetUpError(f"electrochemical plant: parameters = {name!r}{why}, allowed are a BPX file (.json) and {', '.join(SETS)}")
     return pybamm.ParameterValues(name)
 

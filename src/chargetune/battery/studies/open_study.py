@@ -127,12 +127,14 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
             "is not known to be safe for this one; allowed is one of the two"
         )
     problem = config.problem(folder)
+    with config.named():
+        tuner = make_tuner(config.study.tuner, config.study.seed, problem, config.twin)
     return Study.create_or_resume(
         store,
         config.study.name,
         config=config.document(folder),
         space=problem.space,
-        tuner=make_tuner(config.study.tuner, config.study.seed, problem, config.twin),
+        tuner=tuner,
         seed=config.study.seed,
         batch=config.study.batch,
         earlier=config.earlier(folder),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, PrivateAttr, Tag, ValidationError, field_validator
 
 from chargetune.battery.cell.cell import PACK, PACK_MAX, Cell, default_cell, load_cell
 from chargetune.battery.cell.plating import Anode
@@ -159,25 +160,42 @@ class Config(_Table):
     """What is unknown of the plant before the first trial, for the tuner "twin"."""
     range: ChargingRangeSettings | None = None
     """What differs between the cells and charges that the controller will meet."""
+    _file: str = PrivateAttr(default="")
 
     def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant: Plant | None = None) -> ChargingProblem:
         """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant`` stand in for the files'.
 
         Raises ValueError, FileNotFoundError.
         """
-        return ChargingProblem(
-            cell=cell or self._cell(folder),
-            plant=plant or self._plant(folder),
-            controller=self.controller,
-            estimator=self.estimator,
-            limits=self.limits,
-            episode=self.episode,
-            sensors=self.sensors,
-            objective=self.objective,
-            theta=self.theta,
-            safety=self.safety,
-            range=self.range,
-        )
+        with self.named():
+            return ChargingProblem(
+                cell=cell or self._cell(folder),
+                plant=plant or self._plant(folder),
+                controller=self.controller,
+                estimator=self.estimator,
+                limits=self.limits,
+                episode=self.episode,
+                sensors=self.sensors,
+                objective=self.objective,
+                theta=self.theta,
+                safety=self.safety,
+                range=self.range,
+            )
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Within it, what is refused names the file: what tables say of each other is told as what one says of itself is."""
+        try:
+            yield
+        except FileNotFoundError as error:
+            for key, file in (("cell.file", self.cell.file), ("plant.cell", getattr(self.plant, "cell", None))):
+                if file and error.filename and Path(error.filename).name == Path(file).name:
+                    raise FileNotFoundError(error.errno, error.strerror, f"{self._file}: {key} = {error.filename}".lstrip(": ")) from None
+            raise
+        except ValueError as error:
+            if not self._file or type(error) is not ValueError:
+                raise
+            raise ValueError(f"{self._file}: {error}") from None
 
     def earlier(self, folder: Path | None = None) -> list[Earlier]:
         """The earlier studies; a relative file is looked for in ``folder``."""
@@ -342,7 +360,9 @@ def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def load_config(path: str | Path) -> Config:
     """Read a study file. Raises FileNotFoundError, and ValueError naming file, field, value and what is allowed."""
-    return read_tables(path, Config)
+    config = read_tables(path, Config)
+    config._file = str(path)  # noqa: SLF001 - its own
+    return config
 
 
 def read_tables(path: str | Path, model: type[T]) -> T:

@@ -23,6 +23,7 @@ from chargetune.learning.black_box.optimize_acquisition import candidates, maxim
 from chargetune.learning.initial_design import sobol_points
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.model.parameter_space import ParameterSpace
+from chargetune.runtime.counted import counted
 
 __all__ = ["Composite", "CompositeLoop", "WindowOutputs"]
 
@@ -287,7 +288,7 @@ def _fitted(x: torch.Tensor, y: torch.Tensor, variance: torch.Tensor) -> SingleT
             warnings.simplefilter("ignore")
             return SingleTaskGP(x, y, train_Yvar=variance, covar_module=kernel, outcome_transform=None)
 
-    model = fitted(fresh, f"the model of {len(x)} trials", attempts=1, iterations=FIT_ITERATIONS)
+    model = fitted(fresh, f"the model of {counted(len(x), 'trial')}", attempts=1, iterations=FIT_ITERATIONS)
     model.eval()
     return model
 

@@ -22,6 +22,8 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from linear_operator.utils.errors import NanError, NotPSDError
 from torch.linalg import LinAlgError  # type: ignore[attr-defined] # documented, but not in its __all__
 
+from chargetune.runtime.counted import counted
+
 __all__ = ["FAILURES", "GaussianProcess", "SurrogateWarning", "fitted", "posterior"]
 
 # Iterations of a fit, at most: later ones change the hyperparameters in their third digit.
@@ -70,7 +72,7 @@ class GaussianProcess:
             raise ValueError(f"surrogate: x has shape {tuple(x.shape)} and y {tuple(y.shape)}, expected (n, d) and (n, m) with n >= 1")
         if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
             raise ValueError("surrogate: x and y must be finite")
-        model = fitted(lambda: self._model(x, y), f"the surrogate of {len(y)} trials", attempts=2, iterations=self.iterations)
+        model = fitted(lambda: self._model(x, y), f"the surrogate of {counted(len(y), 'trial')}", attempts=2, iterations=self.iterations)
         model.eval()
         return model
 

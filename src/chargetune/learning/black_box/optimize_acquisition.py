@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from chargetune.learning.black_box.gaussian_process import FAILURES
 from chargetune.learning.initial_design import sobol_points
+from chargetune.runtime.counted import counted
 
 __all__ = ["candidates", "maximise", "reproducible"]
 
@@ -90,7 +91,9 @@ def maximise(
             best = found[0]
     except (*FAILURES, CandidateGenerationError) as error:
         # The acquisition is flat or ill-conditioned.
-        warnings.warn(f"the acquisition was not maximised, the best of {len(points)} points stands ({error})", RuntimeWarning, stacklevel=2)
+        warnings.warn(
+            f"the acquisition was not maximised, the best of {counted(len(points), 'point')} stands ({error})", RuntimeWarning, stacklevel=2
+        )
     done = torch.as_tensor(np.asarray(taken, dtype=float)).reshape(-1, d)
     if len(done) and (done - best).abs().amax(1).min() < DUPLICATE:
         order = values.argsort(descending=True)

@@ -14,6 +14,7 @@ from scipy.sparse import csr_matrix, hstack, identity
 from chargetune.control.controller import Controller
 from chargetune.episode.episode import Episode
 from chargetune.runtime.cache import cached
+from chargetune.runtime.counted import counted
 from chargetune.runtime.hoisting import hoist
 from chargetune.runtime.numpy_call import numpy_call
 
@@ -110,7 +111,9 @@ def covering(
         # Without presolve, which took two fifths of the time and saved no iteration.
         found = linprog(cost, A_ub=matrix, b_ub=-sign * wanted, bounds=bounds, method="highs", options={"presolve": False})
         if found.x is None:
-            warnings.warn(f"the linear program of {n} samples has no solution, theta stays ({found.message})", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"the linear program of {counted(n, 'sample')} has no solution, theta stays ({found.message})", RuntimeWarning, stacklevel=2
+            )
             return theta
         before, theta = theta, np.clip(theta + found.x[:d] - found.x[d : 2 * d], lower, upper)
         if number + 1 == LINEARISATIONS or _rolled(controller).straight:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from chargetune.runtime.counted import counted
+
 __all__ = ["Evaluate", "Linearisation", "Point", "solve_slp"]
 
 # Step of the finite differences: far above the rounding of a closed loop, far below where it bends.
@@ -78,7 +80,7 @@ class Linearisation:
             if found.x is not None:
                 return found.x[:d], float(found.x[d])
             message = found.message
-        warnings.warn(f"a linear program of {len(most)} rows failed, no step ({message})", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"a linear program of {counted(len(most), 'row')} failed, no step ({message})", RuntimeWarning, stacklevel=2)
         return np.zeros(d), float(np.max(rows, initial=0.0))
 
     def decrease(self, step: NDArray[np.float64]) -> float:

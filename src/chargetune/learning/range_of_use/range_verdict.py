@@ -13,6 +13,7 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.range_of_use.range_loop import RangeLoop
 from chargetune.plants.range_of_use import DrawnPlant
+from chargetune.runtime.counted import counted
 
 __all__ = ["Aim", "PlantResult", "RangeEvaluation", "objective_over", "run_plants"]
 
@@ -79,7 +80,11 @@ class RangeEvaluation:
         failed = sum(one.score is None for one in results)
         worst = max(results, key=lambda one: one.beyond)
         if failed:
-            return None, worst.episode, f"{failed} of {len(results)} plants: their episodes did not come to an end or have no verdict"
+            return (
+                None,
+                worst.episode,
+                f"{failed} of {counted(len(results), 'plant')}: the episode did not come to an end or have no verdict",
+            )
         return self._score(results), worst.episode, "done"
 
     def _score(self, results: Sequence[PlantResult]) -> Score:

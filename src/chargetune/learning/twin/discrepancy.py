@@ -24,6 +24,7 @@ from chargetune.learning.twin.posterior import Posterior
 from chargetune.learning.twin.residuals import binned_residuals, measured
 from chargetune.learning.twin.rollout import predict, predict_each
 from chargetune.learning.twin.settings import TwinSettings
+from chargetune.runtime.counted import counted
 from chargetune.runtime.threads import parallel_map
 
 __all__ = ["Discrepancy", "DiscrepancySample"]
@@ -293,7 +294,7 @@ def _features(episode: Episode, names: Iterable[str], predicted: Mapping[str, ND
         if seen.all():
             return out
         if not seen.any():
-            raise ValueError(f"discrepancy: {name} was never measured in an episode of {len(episode)} intervals")
+            raise ValueError(f"discrepancy: {name} was never measured in an episode of {counted(len(episode), 'interval')}")
         time = np.arange(seen.size).reshape(seen.shape)
         return np.asarray(np.where(seen, out, np.interp(time, time[seen], out[seen])))
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.report.figures.style import BLUE, GREEN, ORANGE, PAGE_IN, RED, cell_note, journal_style, legend_above, letter, new_figure
+from chargetune.runtime.counted import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +76,7 @@ def certificate_figure(path: str | os.PathLike[str]) -> Figure:
             for axis, (name, drawn) in zip(lower[1:], conditions.items(), strict=True):
                 _points(axis, CONDITIONS[name][1] * drawn, times, broken, color)
         if conditions and np.any(broken):
-            handles += lower[0].plot([], [], "x", color=RED, markersize=3.5, label="violating")
+            handles += lower[0].plot([], [], "x", color=RED, markersize=3.5, label="over a limit")
         for unit in units:
             row_of[unit][0].set_ylabel(f"worst excess ({unit})")
         lower[0].set_ylabel("time (min)")
@@ -89,7 +90,7 @@ def certificate_figure(path: str | os.PathLike[str]) -> Figure:
         cell_note(
             figure,
             stated["cell"]["name"],
-            f"{found['episodes']} fresh episodes, {found['violations']} violating, probability of a violation at most "
+            f"{counted(found['episodes'], 'fresh episode')}, {found['violations']} over a limit, probability of a violation at most "
             f"{100 * found['violation_probability_upper']:.2f} % (confidence {100 * stated['confidence']:g} %). "
             f"Study {stated['origin'].get('study', '')}, trial {stated['origin'].get('trial', '')}. {stated['cell']['remark']}",
         )

@@ -174,7 +174,7 @@ def _marks(view: StudyView) -> list[tuple[str, list[Trial], dict[str, Any]]]:
     scored = [t for t in view.trials if t.score is not None]
     kinds: list[tuple[str, list[Trial], dict[str, Any]]] = [
         ("within limits", [t for t in scored if t.feasible], {"marker": "o", "color": GREEN, "markersize": 3.5}),
-        ("violating", [t for t in scored if not t.feasible], {"marker": "^", "color": RED, "markersize": 3.5, "fillstyle": "none"}),
+        ("over a limit", [t for t in scored if not t.feasible], {"marker": "^", "color": RED, "markersize": 3.5, "fillstyle": "none"}),
     ]
     for label, trial, color, marker in ((view.start_label, view.start, BLUE, "s"), (view.tuned_label, view.tuned, ORANGE, "o")):
         if trial is not None and trial.score is not None:

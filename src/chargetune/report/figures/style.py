@@ -118,11 +118,14 @@ def cell_note(figure: Figure, name: str, remark: str) -> None:
         note.set_parse_math(False)
 
 
-def check_format(path: str | os.PathLike[str]) -> str:
-    """The format that the path's ending names. Raises ValueError, so that nobody waits for a figure that cannot be written."""
+def check_format(path: str | os.PathLike[str], what: str = "figure") -> str:
+    """The format that the path's ending names. Raises ValueError, so that nobody waits for a figure that cannot be written.
+
+    ``what`` is how the message begins: the option that the path came from, for instance.
+    """
     kind = Path(path).suffix.removeprefix(".").lower()
     if kind not in FORMATS:
-        raise ValueError(f"figure {path}: format {kind!r}, allowed are {', '.join(FORMATS)}")
+        raise ValueError(f"{what} {path}: format {kind!r}, allowed are {', '.join(FORMATS)}")
     return kind
 
 

@@ -15,6 +15,7 @@ from chargetune.report.page.trial_rows import objective_text
 from chargetune.report.safety import Promise
 from chargetune.report.sensitivity import Importance
 from chargetune.report.study_view import StudyView
+from chargetune.runtime.counted import counted
 from chargetune.study.trial import TrialStatus
 
 __all__ = ["certificate", "certificate_of", "other_studies", "promises", "theta_figures", "trials"]
@@ -91,7 +92,7 @@ def certificate(view: StudyView, stated: dict[str, Any] | None) -> str:
         return section("Certificate", paragraph(said))
     found, trial = stated["figures"], stated["origin"]["trial"]
     bound = f"{100 * found['violation_probability_upper']:.2f} % (confidence {100 * stated['confidence']:g} %)"
-    said = f"Trial {trial} on {found['episodes']} fresh episodes of its range of use: {found['violations']} broke a limit; "
+    said = f"Trial {trial} on {counted(found['episodes'], 'fresh episode')} of its range of use: {found['violations']} broke a limit; "
     parts = [paragraph(f"{said}probability of a violation at most {bound}.", "good" if not found["violations"] else "")]
     if view.tuned is not None and trial != view.tuned.number:
         parts.append(paragraph(f"It is of trial {trial}; the result of the study is trial {view.tuned.number}.", "bad"))

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
-from chargetune.battery.charging.wording import metric_words
 from chargetune.episode.score import Score
 from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
@@ -15,7 +14,8 @@ from chargetune.report.page.html import Cell, beside, paragraph, section, table
 from chargetune.report.page.trial_rows import study_head
 from chargetune.report.sensitivity import STEP, Sensitivity, again, rank_correlations
 from chargetune.report.study_view import StudyView
-from chargetune.report.words import limits_of_study, objective_of_study
+from chargetune.report.words import limits_of_study, metrics_of_study, objective_of_study
+from chargetune.runtime.counted import counted
 from chargetune.study.store.database import store_name
 from chargetune.study.trial import Trial, TrialStatus
 
@@ -28,7 +28,7 @@ def opening(view: StudyView) -> str:
     broke = sum(not t.feasible for t in done)
     failed = sum(t.status is TrialStatus.FAILED for t in view.trials)
     running = sum(t.status is TrialStatus.RUNNING for t in view.trials)
-    counts = f"{len(view.trials)} trials: {len(done) - broke} within the limits, {broke} beyond one, {failed} failed"
+    counts = f"{counted(len(view.trials), 'trial')}: {len(done) - broke} within the limits, {broke} beyond one, {failed} failed"
     apart = sum(t.status is TrialStatus.APART for t in view.trials)
     more = (f", {apart} set apart" if apart else "") + (f", {running} not told yet" if running else "")
     best = view.tuned
@@ -46,9 +46,8 @@ def opening(view: StudyView) -> str:
 def _plants_over(trial: Trial | None) -> str:
     """Of a range of use: on how many of the drawn plants a limit was broken."""
     drawn = {} if trial is None or trial.score is None else trial.score.metrics
-    if "plants" not in drawn:
-        return ""
-    return f" ({drawn['violating_plants']:.0f} of {drawn['plants']:.0f} drawn plants over a limit)"
+    over, plants = drawn.get("violating_plants"), drawn.get("plants")
+    return "" if over is None or plants is None else f" ({over:.0f} of {counted(int(plants), 'drawn plant')} over a limit)"
 
 
 def _headline(view: StudyView) -> str:
@@ -88,7 +87,7 @@ def what_was_tuned(view: StudyView) -> str:
             ("plant", problem.plant_line),
             ("controller's parameters", belief),
             ("estimator", problem.estimator.line),
-            ("sampling time, horizon", f"{control.sampling_time_s:g} s, {control.horizon} intervals"),
+            ("sampling time, horizon", f"{control.sampling_time_s:g} s, {counted(control.horizon, 'interval')}"),
             (
                 "charge",
                 f"SOC {start} to {charge.soc_target:g}, at most {charge.steps * control.sampling_time_s / 60:g} min",
@@ -137,11 +136,11 @@ def result(view: StudyView, feedback: Score | None = None) -> str:
         rows.append((x["entry"], value, x["untuned"], x["unit"], x["lower"], x["upper"], at))
     headings = ("theta", f"trial {best.number}", "untuned", "unit", "lower", "upper", "")
     scores = [start.score if start is not None else None, *([feedback] if feedback is not None else []), best.score]
-    names = dict.fromkeys(name for score in scores if score is not None for name in score.metrics)
     figures: list[tuple[Cell, ...]] = []
-    for name in names:
-        label, unit = metric_words(name)
-        figures.append((label, *(None if score is None else score.metrics.get(name) for score in scores), (unit, "text")))
+    for name, words in metrics_of_study(view).items():
+        values = [None if score is None else score.metrics.get(name) for score in scores]
+        if any(value is not None for value in values):
+            figures.append((words.label, *(None if v is None else words.factor * v for v in values), (words.unit, "text")))
     what = "Best theta within the limits" if best.feasible else "theta of the result, which broke a limit"
     other = ["untuned, offset_free"] if feedback is not None else []
     merit = table(("figure of merit", view.start_label, *other, f"trial {best.number}", ("unit", "text")), figures)
@@ -170,7 +169,7 @@ def limits(view: StudyView) -> str:
         if trial is not None and trial.number in checks:
             parts.append(_check_table(f"{label}, trial {trial.number}", checks[trial.number]))
     wrong = [number for number, found in checks.items() if not all(c.agrees for c in found)]
-    text = f"{len(checks)} trials with a trace were judged again; "
+    text = f"Judged again: {counted(len(checks), 'trial')} with a trace; "
     if wrong:
         parts.append(paragraph(f"{text}in trials {', '.join(map(str, wrong))} the stored score says something else.", "bad"))
     elif view.over_range:
@@ -217,7 +216,7 @@ def violations(view: StudyView) -> str:
             rows.append((limit.label, len(over), said, number, min(n for _, n in over), max(n for _, n in over)))
     return section(
         title,
-        paragraph(f"{len(broke)} of {len(view.trials)} trials went beyond a limit by more than its tolerance."),
+        paragraph(f"{len(broke)} of {counted(len(view.trials), 'trial')} went beyond a limit by more than its tolerance."),
         table(("limit", "trials", "worst excess", "in trial", "first", "last"), rows),
     )
 
@@ -270,13 +269,13 @@ def provenance(view: StudyView, best: Trial | None, *, reproduced: bool) -> str:
             ("its seed", str(best.seed)),
             ("its trace (SHA-256)", best.trace_sha256),
         ]
-        rows += [(f"made with {name}", str(v)) for name, v in best.provenance.get("versions", {}).items()]
+        rows.append(("made with", ", ".join(f"{name} {version}" for name, version in best.provenance.get("versions", {}).items())))
         if reproduced and view.problem is not None:
             off = again(view, best)
             rows.append(("evaluated again now, largest difference", "no score" if off is None else f"{off:.1e}"))
     others = {json.dumps(t.provenance.get("versions"), sort_keys=True) for t in view.trials}
     if len(others) > 1:
-        rows.append(("further versions", f"the trials were made with {len(others)} different sets of programs"))
+        rows.append(("further versions", f"the trials were made with {counted(len(others), 'different set')} of programs"))
     parts = [table(("", ""), [(a, (str(b), "long text")) for a, b in rows], kind="facts")]
     if record is not None:
         text = escape(json.dumps(record.identity, indent=1, ensure_ascii=False))

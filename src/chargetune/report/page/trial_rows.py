@@ -5,17 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
-from chargetune.battery.charging.wording import metric_words
 from chargetune.episode.episode import Episode
+from chargetune.episode.score import Score
 from chargetune.report.best_possible import best_possible
 from chargetune.report.figures.convergence import drawn_limits, linear_within, loss
 from chargetune.report.study_view import StudyView
-from chargetune.report.words import limits_of_study, objective_of_study
+from chargetune.report.words import MetricWords, limits_of_study, metrics_of_study, objective_of_study
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["objective_text", "study_head", "study_summary", "theta_document", "trace_csv", "trial_rows"]
@@ -31,7 +31,6 @@ def study_head(view: StudyView) -> dict[str, Any]:
     possible = best_possible(view)
     units = [p.unit for p in space.parameters for _ in range(p.size)]
     scales = [p.scale for p in space.parameters for _ in range(p.size)]
-    names = dict.fromkeys(name for t in view.trials if t.score is not None for name in t.score.metrics)
     return {
         "id": None if record is None else record.id,
         "name": view.name,
@@ -58,7 +57,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
             }
             for limit in limits_of_study(view)
         ],
-        "metrics": {name: list(metric_words(name)) for name in names},
+        "metrics": {name: [metric.label, metric.unit] for name, metric in metrics_of_study(view).items()},
         "limits": limits_of(view),
         "theta": [
             {
@@ -94,7 +93,7 @@ def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]
 
     Both are None without a score. ``counted``: it may be the incumbent, being within the limits, or for the tuner "ei" scored.
     """
-    words, limits = objective_of_study(view), limits_of_study(view)
+    words, limits, metrics = objective_of_study(view), limits_of_study(view), metrics_of_study(view)
     return [
         {
             "number": trial.number,
@@ -107,7 +106,7 @@ def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]
                 limit.name: None if trial.score is None else _finite(limit.factor * trial.score.excess.get(limit.name, math.nan))
                 for limit in limits
             },
-            "metrics": {} if trial.score is None else {name: _finite(v) for name, v in trial.score.metrics.items()},
+            "metrics": {} if trial.score is None else _told(metrics, trial.score),
             "theta": [_finite(v) for v in trial.theta],
             "asked_at": trial.asked_at,
             "told_at": trial.told_at or "",
@@ -115,6 +114,11 @@ def trial_rows(view: StudyView, trials: Sequence[Trial]) -> list[dict[str, Any]]
         }
         for trial in trials
     ]
+
+
+def _told(metrics: Mapping[str, MetricWords], score: Score) -> dict[str, float | None]:
+    found = {name: score.metrics.get(name) for name in metrics}
+    return {name: None if value is None else _finite(metrics[name].factor * value) for name, value in found.items()}
 
 
 def objective_text(view: StudyView, trial: Trial | None) -> str:

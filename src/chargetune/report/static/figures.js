@@ -120,7 +120,7 @@ const Figures = (() => {
 
   const KINDS = [
     ["within limits", "ok", "circle", (row) => row.feasible === true],
-    ["violating", "limit", "triangle-up-open", (row) => row.feasible === false],
+    ["over a limit", "limit", "triangle-up-open", (row) => row.feasible === false],
   ];
   const unit = (text) => (text ? ` (${text})` : "");
   const decade = (values) => values.length > 0 && Math.min(...values) > 0 && Math.max(...values) > 10 * Math.min(...values);
@@ -184,7 +184,8 @@ const Figures = (() => {
       const squeezed = rows.map((row) => squeeze(row.excesses[limit.name], limit.within)).filter((value) => value !== null);
       const low = Math.min(-squeeze(1, 1), ...squeezed), high = Math.max(squeeze(1, 1), ...squeezed), room = 0.08 * (high - low);
       // Over several decades the ones would stand on the zero.
-      const ticks = [-1000, -100, -10, ...(high - low < 2 ? [-1, 0, 1] : [0]), 10, 100, 1000];
+      const between = high - low < 3.5 ? [-300, -30, 30, 300] : [];
+      const ticks = [-1000, -100, -10, ...between, ...(high - low < 2 ? [-1, 0, 1] : [0]), 10, 100, 1000];
       layout[`yaxis${k + 2}`] = axis("", { domain: span(k), tickvals: ticks.map((tick) => squeeze(tick, 1)), ticktext: ticks.map((tick) => String(Number((tick * limit.within).toPrecision(1)))), range: [low - room, high + room] });
       shapes.push({ ...level(0), yref: axisOf(k) });
       if (limit.tolerance) shapes.push({ ...level(squeeze(limit.tolerance, limit.within)), yref: axisOf(k), line: { color: colour("limit"), width: 1, dash: "dot" } });

@@ -2,6 +2,7 @@
 // The table of trials, and the figures of theta that are chosen above it: used by the report and by the live page alike.
 // Text goes in as text, never as markup.
 const short = (value) => (typeof value === "number" ? (Number.isInteger(value) ? String(value) : value.toPrecision(4)) : value || "-");
+const counted = (count, one, many) => `${count} ${count === 1 ? one : many || `${one}s`}`;
 const named = (text, unit) => (unit ? `${text} (${unit})` : text);
 
 const Trials = (where, rows, choose) => {
@@ -118,7 +119,7 @@ const Trials = (where, rows, choose) => {
     const value = (columns.find(({ key }) => key === sorting.key) || columns[0]).value, sign = sorting.down ? -1 : 1;
     const none = (v) => v === null || v === "" || v === undefined;
     const found = [...rows.values()].filter(passes);
-    said.textContent = found.length === rows.size ? `${rows.size} trials` : `${found.length} of ${rows.size} trials`;
+    said.textContent = found.length === rows.size ? counted(rows.size, "trial") : `${found.length} of ${counted(rows.size, "trial")}`;
     // What has no value stays below, whichever way.
     found.sort((a, b) => {
       const x = value(a), y = value(b);

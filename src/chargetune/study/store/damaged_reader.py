@@ -11,6 +11,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Engine, Row, Table, func, inspect, literal_column, select
 from sqlalchemy.exc import DBAPIError
 
+from chargetune.runtime.counted import counted
 from chargetune.study.serialization import canonical_json, sha256
 from chargetune.study.store import schema
 from chargetune.study.store.database import Database
@@ -166,7 +167,7 @@ def _rows(database: Database, engine: Engine, table: Table, findings: list[Damag
         elif last is None and misses == STRAY:
             break
     if lost:
-        many = "rows" if last is None else f"{lost} of at most {last} rows"
+        many = "rows" if last is None else f"{lost} of at most {counted(last, 'row')}"
         findings.append(Damage(None, None, f"{many} of the table {table.name} cannot be read ({why})"))
 
 

@@ -29,6 +29,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from chargetune.runtime.counted import counted
 from chargetune.study.serialization import canonical_json
 
 __all__ = ["TraceFacts", "Traceable", "content_sha256", "decode", "encode", "expand", "facts"]
@@ -97,7 +98,7 @@ def decode(data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     except (struct.error, zstandard.ZstdError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"trace: damaged ({error})") from error
     if position != len(content):
-        raise ValueError(f"trace: damaged ({len(content)} bytes, its header says {position})")
+        raise ValueError(f"trace: damaged ({counted(len(content), 'byte')}, its header says {position})")
     return arrays, meta
 
 
@@ -124,7 +125,7 @@ def facts(data: bytes) -> TraceFacts:
 def expand(block: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], name_of_filter: str) -> NDArray[Any]:
     """The array of a filtered block. Raises ValueError when they do not fit together."""
     if len(block) != math.prod(shape) * dtype.itemsize:
-        raise ValueError(f"{len(block)} bytes for shape {shape} of {dtype}")
+        raise ValueError(f"{counted(len(block), 'byte')} for shape {shape} of {dtype}")
     if name_of_filter == "raw":
         return np.frombuffer(block, dtype).reshape(shape).copy()
     if name_of_filter == "delta+shuffle":

@@ -164,7 +164,10 @@ function compare(shown) {
   add("limits", both.map((row) => (row.feasible === null ? "" : row.feasible ? "kept" : "broken")));
   add(head.objective.label, both.map((row) => row.value));
   for (const { name, label, unit } of head.excesses) add(named(label, unit), both.map((row) => row.excesses[name] ?? null));
-  for (const [name, [label, unit]] of Object.entries(head.metrics)) add(named(label, unit), both.map((row) => row.metrics[name] ?? null));
+  for (const [name, [label, unit]] of Object.entries(head.metrics)) {
+    const values = both.map((row) => row.metrics[name] ?? null);
+    if (values.some((value) => value !== null)) add(named(label, unit), values);
+  }
   for (const { entry, unit } of head.theta) add(named(entry, unit), picked.map(({ drawing: found }) => found.theta[entry]));
   where("compared-rows").replaceChildren(...body);
 }
@@ -173,7 +176,7 @@ function compare(shown) {
 
 function tell() {
   const list = [...rows.values()], count = (test) => list.filter(test).length;
-  where("counts").textContent = `${list.length} trials: ${count((row) => row.feasible === true)} within the limits, `
+  where("counts").textContent = `${counted(list.length, "trial")}: ${count((row) => row.feasible === true)} within the limits, `
     + `${count((row) => row.feasible === false)} beyond one, ${count((row) => row.status === "failed")} failed, `
     + (count((row) => row.status === "apart") ? `${count((row) => row.status === "apart")} set apart, ` : "")
     + `${count((row) => row.status === "running")} running.`;
@@ -187,7 +190,8 @@ const state = (text, kind) => {
 
 function about() {
   const why = result && (result.trial === null ? `no result: ${result.sentence}` : `the result is trial ${result.trial}: ${result.sentence}`);
-  const parts = [head.cell, head.tuner && `tuner ${head.tuner}`, `${head.theta.length} entries of theta`, head.remark, why];
+  const parts = [head.cell, head.tuner && `tuner ${head.tuner}`,
+    counted(head.theta.length, "entry of theta", "entries of theta"), head.remark, why];
   where("about").textContent = parts.filter(Boolean).join("; ");
 }
 source.addEventListener("study", (event) => {
