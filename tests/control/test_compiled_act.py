@@ -32,6 +32,7 @@ def test_another_theta_is_another_controller():
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.compiled_code(quick=True)
 @pytest.mark.parametrize("change", [{}, {"blocks": (1, 1, 2, 6)}])
 def test_a_problem_written_as_loops_is_compiled_to_the_same_closed_loop(change):
     own, plant = linear(12, 4, 6, horizon=10, **change)
