@@ -6,7 +6,8 @@ capacity 2 %, age up to R times 1.5 and Q times 0.8, 2 mV of noise, only voltage
 R1        no trial: theta chosen in simulation on draws of the range, judged on fresh ones
 learn     each of ``--cells`` cells of R1: no charge, then one to ``--charges`` charges, each judged on fresh charges of that cell
 crane     examples/range_crane.py, ratio: distance integral to that of a theta tuned for each drawn crane alone
-DFN       examples/range_dfn.toml: limits of voltage, temperature and anode potential on PyBaMM's DFN, after ``--charges`` charges
+DFN       examples/range_dfn.toml: limits of voltage, temperature and anode potential on PyBaMM's DFN: the declared start over the whole
+          range, then each of ``--cells`` cells after ``--charges`` charges, if that is not 0
 structural  the plant of benchmarks/learning_plants.py that no circuit is, from SOC 0.05 to 0.4: the first theta is chosen on the circuits
           of R1, the controller's model differs from seed to seed
 
@@ -196,9 +197,15 @@ def rows_learn(options):
 
 
 def rows_dfn(options):
-    """The electrochemical plant: each cell is a draw of resistance, capacity and age."""
+    """The electrochemical plant: the declared start over the whole range, then each cell, a draw of resistance, capacity and age."""
     problem = load_config(EXAMPLES / "range_dfn.toml").problem(EXAMPLES)
-    for cell in options.cells:
+    use = ChargingRange(replace(problem, range=replace(problem.range, cell=None)))
+    for seed in options.seeds:
+        plants = fresh(use, seed, options.draws)
+        best = oracle(use, plants[: options.oracles])
+        label, theta = "DFN, the declared start", problem.safe_start
+        yield judged(use, theta, plants, best, label, options, range="DFN", plant="DFN", seed=seed, tune_s=0.0, trials=0)
+    for cell in options.cells if options.charges else ():
         own = replace(problem, range=replace(problem.range, cell=cell))
         use = ChargingRange(own)
         plants = fresh(use, cell, options.draws)
