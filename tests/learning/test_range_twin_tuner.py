@@ -102,6 +102,21 @@ def test_a_plant_that_is_none_of_the_range_is_said_and_the_first_theta_stays():
         TUNER.ask(SPACE, trials)
 
 
+def test_a_charge_that_kept_what_no_draw_keeps_is_believed_and_not_the_draws():
+    """The twin is told a limit of half the height: all of its draws break it with a theta that kept the real one."""
+    strict = replace(LOOP.range, limits=(ct.ScoredLimit("T", upper=LIMIT / 2, tolerance=5e-3),))
+    tuner = ct.RangeTwinTuner(ct.SimulatedRangeTwin(strict), settings=SETTINGS)
+    trials, _ = told(TUNER, 1)
+    found = tuner.proposed(SPACE, trials)
+    assert (found.choice, found.theta, found.probability) == (Choice.REPEATED, trials[0].theta, 0.0)
+    assert "it kept every limit, which it does on 0.000 of the draws" in found.why
+    with pytest.warns(RuntimeWarning, match="these are not of this plant"):
+        tuner.ask(SPACE, trials)
+    # Of a charge that broke the limit the same draws say the truth: theta is chosen on them.
+    trials[0].score = strict.score(trials[0].episode())
+    assert tuner.proposed(SPACE, trials).choice is Choice.CONDITIONED
+
+
 def test_draws_after_a_trace_are_of_its_plant_in_fresh_episodes():
     trials, _ = told(TUNER, 1)
     loop = ConditionedRange.of(LOOP, learn(LOOP, trials), SPACE.default)
@@ -159,6 +174,8 @@ def test_numbers_of_the_settings_are_checked():
     for name in ("rounds", "judges"):
         with pytest.raises(ValueError, match=f"range twin settings: {name} = 0, allowed is an integer >= 1"):
             ct.RangeTwinSettings(**{name: 0})
+    with pytest.raises(ValueError, match=r"range twin settings: contradicted = 1\.0, allowed is \[0, 1\)"):
+        ct.RangeTwinSettings(contradicted=1.0)
 
 
 def test_scores_of_the_nominal_plant_change_nothing():

@@ -59,12 +59,16 @@ class RangeTwinSettings:
     first, later
         Settings of the search without a trace, and after one, when what is left differs less. From the last theta alone it stops at one
         that is careful where nothing asks for it any more, so it has other starts too.
+    contradicted
+        Share of the draws from which a charge that kept its limits contradicts them: if fewer keep them, such a charge had that small a
+        chance.
     twin
         Settings of the posterior and of the discrepancy.
     """
 
     rounds: int = 4
     judges: int = 300
+    contradicted: float = 0.05
     first: RangeSettings = field(default_factory=RangeSettings)
     later: RangeSettings = field(default_factory=lambda: RangeSettings(plants=32, pool=8, iterations=12))
     twin: TwinSettings = field(default_factory=TwinSettings)
@@ -74,6 +78,9 @@ class RangeTwinSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"range twin settings: {name} = {value!r}, allowed is an integer >= 1")
+        share = self.contradicted
+        if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share < 1:
+            raise ValueError(f"range twin settings: contradicted = {share!r}, allowed is [0, 1)")
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,8 @@ class RangeTwinTuner:
     3. It is proposed if it keeps every limit on a share of fresh draws half-way between ``safety.probability`` and 1, as the share of some
        hundred draws is itself uncertain, and is better there than the theta tried last; else that one again, if it does; else whichever
        keeps them on at least the stated share; else the one of the first trial.
-    4. Where the traces are of no plant of the range (`Learnt.rejected`) the first trial's theta again, with a warning.
+    4. Where the traces are of no plant of the range (`Learnt.rejected`) the first trial's theta again, with a warning. Where the newest
+       episode kept every limit, and hardly a draw does with its theta, that one again, with a warning: the draws are not of this plant.
 
     Deterministic. All thetas of a batch are the same, since the next one needs the trace of this one. ``proposed`` says what was chosen and
     why. Raises `NoSafeThetaError` when the budget of violation is spent.
@@ -156,11 +164,14 @@ class RangeTwinTuner:
         return found
 
     def _next(self, space: ParameterSpace, learnt: Learnt, done: Sequence[TrialLike]) -> Proposed:
-        last, number = np.array(done[-1].theta), len(done)
-        theta, kept, worth = self._search(space, ConditionedRange.of(self.loop, learnt, last), self.settings.later, number)
+        last, number, score = np.array(done[-1].theta), len(done), done[-1].score
         whole = ConditionedRange(self.loop, learnt, last, np.ones(len(last), dtype=bool))
         evaluation, seed = RangeEvaluation(whole, self.settings.judges), self._seed(number, self.settings.rounds)
         share, value = _judged(evaluation(last, seed)[0])
+        if share < self.settings.contradicted and score is not None and score.feasible:
+            why = f"it kept every limit, which it does on {share:.3f} of the draws: these are not of this plant"
+            return Proposed(tuple(last), Choice.REPEATED, share, why)
+        theta, kept, worth = self._search(space, ConditionedRange.of(self.loop, learnt, last), self.settings.later, number)
         for demanded in (self._surely, self.safety.probability):
             if kept >= demanded and (share < demanded or worth > value):
                 return Proposed(theta, Choice.CONDITIONED, kept)
