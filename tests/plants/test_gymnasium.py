@@ -64,7 +64,7 @@ def test_end_of_the_environments_time_ends_the_episode():
 
 
 def test_what_is_no_plant_is_refused():
-    with pytest.raises(ValueError, match=r"action space Discrete\(2\), allowed is a Box of 1 numbers: torque"):
+    with pytest.raises(ValueError, match=r"action space Discrete\(2\), allowed is a Box of 1 number: torque"):
         pendulum("CartPole-v1")
     bare = GymnasiumPlant(gymnasium.make("Pendulum-v1"), TORQUE, OUTPUTS, 0.05)
     episode = run_episode(controller(), bare, steps=2)
