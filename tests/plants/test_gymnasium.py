@@ -69,7 +69,7 @@ def test_what_is_no_plant_is_refused():
     bare = GymnasiumPlant(gymnasium.make("Pendulum-v1"), TORQUE, OUTPUTS, 0.05)
     episode = run_episode(controller(), bare, steps=2)
     assert episode.ending is Ending.PLANT
-    assert "3 numbers are observed, expected 2: angle, speed" in episode.message
+    assert "observed: 3 numbers, expected 2: angle, speed" in episode.message
     plant = pendulum()
     plant.reset(0)
     with pytest.raises(RuntimeError, match="outside the action space"):
