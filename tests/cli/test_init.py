@@ -1,5 +1,7 @@
 """A first study file, as a user gets it."""
 
+import re
+import tomllib
 from pathlib import Path
 
 from commands import chargetune
@@ -50,3 +52,13 @@ def test_the_ramp_that_it_tells_of_is_one_that_can_be_tuned(tmp_path):
         text = text.replace(f"# {line}", line)
     path.write_text(text)
     assert "current_ramp_A_s" in load_config(path).problem(tmp_path).space.entries
+
+
+def test_a_slow_cell_gets_a_charge_that_is_long_enough(tmp_path):
+    """What `identify` writes has the largest current of a pulse test: at C/2 an hour fills no cell, and then nothing was to be tuned."""
+    text = (EXAMPLES / "okane2022.toml").read_text()
+    capacity = tomllib.loads(text)["capacity_Ah"]
+    (tmp_path / "cell.toml").write_text(re.sub(r"(?m)^current_max_A = .*", f"current_max_A = {capacity / 2}", text))
+    chargetune("init", tmp_path / "mine.toml", "--cell", tmp_path / "cell.toml")
+    assert load_config(tmp_path / "mine.toml").episode.steps == 1080
+    assert "nothing found" in chargetune("check", tmp_path / "mine.toml").stdout

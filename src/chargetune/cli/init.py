@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from chargetune.study.files import write_whole
 
 __all__ = ["init_command"]
 
+# Intervals of 10 s in an hour.
+STEPS = 360
 TEXT = """\
 # A study of fast charging. Every key is optional; what stands here is the default or a sensible beginning.
 # Next: `chargetune check {name}`, then `chargetune tune {name}`.
@@ -42,7 +45,7 @@ kind = "offset_free" # reads voltage and current; a disturbance on the voltage f
 voltage_noise_sd_V = 0.002
 
 [episode]
-steps = 360 # intervals of one charge
+steps = {steps} # intervals of one charge: {why}
 soc_start = 0.1
 soc_target = 0.95
 
@@ -79,14 +82,19 @@ growth = 0.2             # and all resistances have grown by this one
 def init_command(path: Path, *, cell: Path | None, overwrite: bool) -> None:
     """Write a commented study file that runs. Raises ValueError where it may not be written, or the cell file is none."""
     claim([Output("study file", path, Kind.STUDY)], inputs=[] if cell is None else [cell], overwrite=overwrite, folders=False)
-    largest = 6.0
+    largest, steps, why = 6.0, STEPS, "an hour"
     line = '# file = "cell.toml" # as `chargetune identify` writes it; without it the case study\'s cell'
     if cell is not None:
-        largest = load_cell(cell).current_max_A
+        known = load_cell(cell)
+        largest = known.current_max_A
+        # From empty to full at the largest current, and half of that again for the limits.
+        needed = STEPS * 1.5 * known.capacity_Ah / largest
+        if needed > STEPS:
+            steps, why = 60 * math.ceil(needed / 60), "half as long again as the largest current takes from empty to full"
         line = f"file = {json.dumps(os.path.relpath(cell, path.parent))}"
     # A minute from rest to the largest current; tuned, between five minutes and six seconds.
     ramp = {"ramp": largest / 60, "ramp_least": largest / 300, "ramp_most": largest / 6}
-    text = TEXT.format(name=path.name, stem=path.stem, cell=line, **ramp)
+    text = TEXT.format(name=path.name, stem=path.stem, cell=line, steps=steps, why=why, **ramp)
     write_whole(path, text)
     load_config(path).problem(path.parent)
     console().print(f"study file in {path}\nnext: chargetune check {path}", markup=False, soft_wrap=True)
