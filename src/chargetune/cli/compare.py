@@ -136,7 +136,7 @@ def _over_range(
     line = "" if problem.range is None else problem.range.line
     screen.print(
         f"Range of use: {line}. The same {counted(draws, 'drawn plant')} in every row, judged by their true outputs. CC-CV has the "
-        "fastest rate, and the constant backoff the smallest value, with which all of these plants keep every limit, or the most "
+        "fastest rate, and the constant backoffs the smallest values, with which all of these plants keep every limit, or the most "
         "cautious one if none does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
         style="dim",
     )
