@@ -70,7 +70,7 @@ def settings_of(options):
     later = RangeSettings(plants=options.plants * 2 // 3, pool=8, iterations=options.iterations)
     rounds, twin = options.rounds, TwinSettings()
     if "margin" in options.without:
-        first, later, rounds = replace(first, aim=1.0), replace(later, aim=1.0), 1
+        first, later, rounds = replace(first, aim=1.0, corners=0), replace(later, aim=1.0, corners=0), 1
     if "discrepancy" in options.without:
         # The median of the scale's prior is 1; without a spread, and a share of next to nothing, it is a tenth.
         twin = replace(twin, scale_sd=10.0, scale_share=0.0)
@@ -285,7 +285,7 @@ def rows_crane(options):
         alone = []
         for one in judges[: options.oracles]:
             only = _Alone(crane.LOOP, one.plant)
-            theta = ct.RangeTuner(ct.RangeEvaluation(only, 1), seed, ct.RangeSettings(plants=1, aim=1.0)).ask(crane.SPACE, [])[0]
+            theta = ct.RangeTuner(ct.RangeEvaluation(only, 1), seed, ct.RangeSettings(plants=1, corners=0, aim=1.0)).ask(crane.SPACE, [])[0]
             alone.append(only.score(only.simulate([theta], [one.plant])[0]).objective)
         own = [one.score.objective for one in judges[: options.oracles]]
         over = sum(not one.score.feasible for one in judges)

@@ -117,3 +117,35 @@ def test_more_draws_begin_with_the_same_ones_and_other_seeds_are_others():
 def test_nonsense_is_refused_by_name(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_corners_are_all_combinations_of_the_extremes():
+    """Of three numbers there are eight; those by entry are drawn as before, and what is given stays so."""
+    use = RangeOfUse(
+        PLANT,
+        (
+            Variation("a", Uniform(0.0, 1.0), starts={"a": 1.0}, of="episode"),
+            Variation("r", Uniform(-0.1, 0.1), parameters={"r": 1.0}, by_entry=True),
+            Variation("c", Normal(0.0, 0.1), parameters={"c": 1.0}),
+            Variation("bias", Uniform(-1.0, 1.0), biases={"a": 1.0}, of="episode"),
+        ),
+    )
+    corners, plain = use.draw(16, 4, extreme=0.01), use.draw(16, 4)
+    own = [(one.values["a"][0], one.values["c"][0], one.values["bias"][0]) for one in corners]
+    low, high = 0.1 * norm.ppf([0.01, 0.99])
+    expected = {(a, c, bias) for a in (0.01, 0.99) for c in (low, high) for bias in (-0.98, 0.98)}
+    assert {tuple(np.round(one, 9)) for one in own[:8]} == {tuple(np.round(one, 9)) for one in expected}
+    assert own[:8] == own[8:]
+    assert [one.values["r"] for one in corners] == [one.values["r"] for one in plain]
+    assert [one.seed for one in corners] == [one.seed for one in plain]
+    scores = np.array([0.1, 0.2, 0.3, 0.4])
+    known = use.draw(4, 4, scores=scores, extreme=0.01)
+    assert {one.values["c"] for one in known} == {use.draw(1, 9, scores=scores)[0].values["c"]}
+    assert len({(one.values["a"], one.values["bias"]) for one in known}) == 4
+    # With many numbers there are too many: some of them.
+    many = RangeOfUse(PLANT, tuple(Variation(f"v{k}", Uniform(-1.0, 1.0), starts={"b": 1.0}) for k in range(9)))
+    values = {tuple(one.values[f"v{k}"][0] for k in range(9)) for one in many.draw(32, 0, extreme=0.25)}
+    assert len(values) > 25
+    assert {v for row in values for v in row} == {-0.5, 0.5}
+    with pytest.raises(ValueError, match=r"extreme = 0.5, allowed is \(0, 0.5\)"):
+        use.draw(1, 0, extreme=0.5)

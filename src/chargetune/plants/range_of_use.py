@@ -16,6 +16,8 @@ __all__ = ["DrawnPlant", "RangeOfUse"]
 
 # Shares of a Sobol sequence are kept off 0 and 1, where a normal quantile is not finite.
 LEAST_SHARE = 1e-6
+# Numbers of which every combination of their ends is drawn in turn: 64 corners; of more, random ones.
+CORNERED = 6
 # Halvings of the interval of shares, to the rounding of a double.
 BISECTIONS = 50
 
@@ -67,12 +69,18 @@ class RangeOfUse:
         if unknown:
             raise ValueError(f"range: start_bounds names unknown {unknown}, allowed are {', '.join(model.state_names)}")
 
-    def draw(self, count: int, seed: int, first: int = 0, *, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
+    def draw(
+        self, count: int, seed: int, first: int = 0, *, scores: NDArray[np.float64] | None = None, extreme: float | None = None
+    ) -> list[DrawnPlant]:
         """Draws ``first`` to ``first + count - 1`` of this seed.
 
         ``scores`` are normal scores of all numbers that are of the plant, in the order of the variations, a row a draw or one row for
         all: what they stand for is not drawn. A number v has the score e with v = quantile(Phi(e)), Phi the normal distribution.
+        With ``extreme`` in (0, 0.5) every number that is drawn and that is not one by entry is at its quantile of this share or at that
+        of 1 - this: their combinations (the corners of the range) in turn, of more than 64 some.
         """
+        if extreme is not None and not 0 < extreme < 0.5:
+            raise ValueError(f"range: extreme = {extreme!r}, allowed is (0, 0.5)")
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ValueError(f"range: count = {count!r}, allowed is an integer >= 1")
         shares = self._shares(first + count, seed)[first:]
@@ -84,6 +92,10 @@ class RangeOfUse:
             if given.shape not in ((count, own), (1, own)):
                 raise ValueError(f"range: scores have the shape {given.shape}, allowed is ({count}, {own}), or one row")
             shares[:, self.of_plant] = np.clip(ndtr(given), LEAST_SHARE, 1.0 - LEAST_SHARE)
+        if extreme is not None:
+            alone = ~np.repeat([one.by_entry for one in self.variations], self.sizes).astype(bool)
+            alone &= ~self.of_plant if scores is not None else True
+            shares[:, alone] = np.where(self._corners(first + count, int(alone.sum()), seed)[first:], 1.0 - extreme, extreme)
         # Noise is drawn anew for each; its seeds have spawn keys that those of a study's trials never have.
         keys = [np.random.SeedSequence(seed, spawn_key=(2, first + k)) for k in range(count)]
         seeds = [int(key.generate_state(1, np.uint64)[0]) >> 11 for key in keys]
@@ -121,6 +133,13 @@ class RangeOfUse:
         # A Sobol sequence is balanced at powers of two; a longer one begins with the shorter.
         points = qmc.Sobol(numbers, scramble=True, rng=np.random.default_rng([seed, 1])).random_base2(int(np.ceil(np.log2(max(count, 2)))))
         return np.asarray(np.clip(points[:count], LEAST_SHARE, 1.0 - LEAST_SHARE))
+
+    @staticmethod
+    def _corners(count: int, numbers: int, seed: int) -> NDArray[np.bool_]:
+        """Which numbers are at their upper end, shape (count, numbers)."""
+        if numbers <= CORNERED:
+            return np.asarray((np.arange(count)[:, None] >> np.arange(numbers)) & 1, dtype=bool)
+        return np.asarray(np.random.default_rng([seed, 2]).random((count, numbers)) < 0.5)
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:

@@ -1,5 +1,6 @@
 """One theta for a range of plants whose best one is known in closed form."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -60,6 +61,23 @@ def test_the_found_theta_is_the_largest_that_the_worst_plant_allows():
     assert 0.98 * best < trials[-1].theta[0] < 1.001 * best
     assert trials[-1].score.metrics["violating_plants"] == 0
     assert trials[-1].score.objective == pytest.approx(0.97 * trials[0].score.objective, rel=0.04)
+
+
+def test_a_corner_that_no_draw_came_near_is_kept():
+    """Two numbers decide, and the largest product of both is drawn once in hundreds: (1.1 * 1.1) power is the limit."""
+    both = ct.RangeOfUse(
+        ct.SimulatedPlant(heater(1.0), {}),
+        tuple(ct.Variation(name, ct.Uniform(-0.1, 0.1), parameters={"gain": 1.0}) for name in ("gain", "valve")),
+    )
+    evaluation = ct.RangeEvaluation(loop(range_of_use=both), 100)
+    few = ct.RangeSettings(plants=4, added=2, pool=2)
+    best, found = LIMIT / (1.1**2 * (1 - 0.8**STEPS)), {}
+    for corners in (0, 8):
+        tuner = ct.RangeTuner(evaluation, seed=0, settings=replace(few, corners=corners))
+        ((found[corners],),) = tuner.ask(SPACE, [])
+    assert found[0] > 1.02 * best
+    # A share of 0.005 of each number is farther out, and half the tolerance is used.
+    assert found[8] == pytest.approx(best, rel=3e-3)
 
 
 def test_a_violation_that_does_not_change_with_theta_is_left_behind():

@@ -115,9 +115,9 @@ class ChargingRange:
     def largest_of(self) -> tuple[str, ...]:
         return LARGEST
 
-    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None, *, extreme: float | None = None) -> list[DrawnPlant]:
         """``scores``: what is of each plant (`RangeOfUse.draw`); None: drawn too, or that of the range's one cell."""
-        return self.range_of_use.draw(count, seed, scores=self._own_scores if scores is None else scores)
+        return self.range_of_use.draw(count, seed, scores=self._own_scores if scores is None else scores, extreme=extreme)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         from chargetune.episode.episode import Ending

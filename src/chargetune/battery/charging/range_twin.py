@@ -87,8 +87,8 @@ class ChargingRangeTwin:
     def largest_of(self) -> tuple[str, ...]:
         return self.use.largest_of
 
-    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
-        return self.range_of_use.draw(count, seed, scores=scores)
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None, *, extreme: float | None = None) -> list[DrawnPlant]:
+        return self.range_of_use.draw(count, seed, scores=scores, extreme=extreme)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         from chargetune.learning.range_of_use.range_twin import run_drawn

@@ -59,17 +59,18 @@ class ConditionedRange:
         out[self.searched] = searched
         return out
 
-    def draw(self, count: int, seed: int) -> list[DrawnPlant]:
+    def draw(self, count: int, seed: int, *, extreme: float | None = None) -> list[DrawnPlant]:
         known, discrepancy = self._drawn, self.learnt.discrepancy
         if discrepancy is None:
-            return list(self.loop.draw(count, seed))
-        if (count, seed) not in known:
+            return list(self.loop.draw(count, seed, extreme=extreme))
+        key = count, seed, extreme
+        if key not in known:
             scores = discrepancy.posterior.draw_scores(count, seed)
             seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
             errors = discrepancy.samples(self.loop.twin.unknowns_at(scores), self.learnt.scale, seeds)
-            plants = self.loop.draw(count, seed, scores)
-            known[count, seed] = [replace(one, error=error.table) for one, error in zip(plants, errors, strict=True)]
-        return known[count, seed]
+            plants = self.loop.draw(count, seed, scores, extreme=extreme)
+            known[key] = [replace(one, error=error.table) for one, error in zip(plants, errors, strict=True)]
+        return known[key]
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         return self.loop.simulate([self.whole(theta) for theta in thetas], plants)
@@ -81,5 +82,5 @@ class ConditionedRange:
         return self.loop.samples(episode)
 
     @cached_property
-    def _drawn(self) -> dict[tuple[int, int], list[DrawnPlant]]:
+    def _drawn(self) -> dict[tuple[int, int, float | None], list[DrawnPlant]]:
         return {}

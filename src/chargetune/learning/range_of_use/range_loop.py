@@ -29,8 +29,8 @@ class RangeLoop(Protocol):
         """Metrics of which the largest of all plants counts; of the others it is their mean."""
         ...
 
-    def draw(self, count: int, seed: int) -> Sequence[DrawnPlant]:
-        """So many plants with their episodes; more draws of a seed begin with the same ones."""
+    def draw(self, count: int, seed: int, *, extreme: float | None = None) -> Sequence[DrawnPlant]:
+        """So many plants with their episodes; more draws of a seed begin with the same ones. ``extreme``: `RangeOfUse.draw`."""
         ...
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
@@ -74,8 +74,8 @@ class SimulatedRange:
     def _cases(self) -> list[Given]:
         return [self.given or {}] if self.given is None or isinstance(self.given, Mapping) else list(self.given)
 
-    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
-        return self.range_of_use.draw(count, seed, scores=scores)
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None, *, extreme: float | None = None) -> list[DrawnPlant]:
+        return self.range_of_use.draw(count, seed, scores=scores, extreme=extreme)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         cases = self._cases

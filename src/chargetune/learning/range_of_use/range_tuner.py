@@ -22,6 +22,10 @@ from chargetune.plants.range_of_use import DrawnPlant
 __all__ = ["RangeSettings", "RangeTuner"]
 
 
+# Searches that go on with corners: each leaves others, fewer ones.
+CORNER_ROUNDS = 2
+
+
 @dataclass(frozen=True)
 class RangeSettings:
     """Numbers of the search over a range of use, each with the reason for its value.
@@ -35,6 +39,9 @@ class RangeSettings:
     first, pool
         Plants on which starts of the search are compared, the worst of the last trial if there is one, and how many Sobol points are
         among the starts: which is clearly worse shows on a few. Without Sobol points the search begins at the last theta alone.
+    corners, extreme
+        Draws at the corners of the range, and the share of each number that is farther out. Of those on which the theta found breaks a
+        limit the worst join the rows, and the search goes on: hardly one of some ten draws is near a given corner.
     iterations, gain
         Of the search, and the share of the objective that one has to win.
     drop_idle
@@ -46,20 +53,24 @@ class RangeSettings:
     aim: float = 0.5
     first: int = 8
     pool: int = 32
+    corners: int = 32
+    extreme: float = 0.005
     iterations: int = 20
     gain: float = 5e-4
     # A study's configuration has it.
     drop_idle: bool = field(default=False, metadata={"identity": False})
 
     def __post_init__(self) -> None:
-        for name in ("plants", "added", "first", "pool", "iterations"):
-            value, least = getattr(self, name), int(name != "pool")
+        for name in ("plants", "added", "first", "pool", "corners", "iterations"):
+            value, least = getattr(self, name), int(name not in ("pool", "corners"))
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"range settings: {name} = {value!r}, allowed is an integer >= {least}")
         for name in ("aim", "gain"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
                 raise ValueError(f"range settings: {name} = {value!r}, allowed is [0, 1]")
+        if isinstance(self.extreme, bool) or not isinstance(self.extreme, (int, float)) or not 0 < self.extreme < 0.5:
+            raise ValueError(f"range settings: extreme = {self.extreme!r}, allowed is (0, 0.5)")
 
 
 @dataclass(frozen=True)
@@ -94,10 +105,24 @@ class RangeTuner:
         # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
         starts = (last, self._start(space, search, last)) if self.settings.pool else (last,)
         found = [search.refine(start) for start in {u.tobytes(): u for u in starts}.values()]
-        theta = space.from_unit(min(found, key=search.merit_of_all))
+        theta = space.from_unit(self._at_corners(search, min(found, key=search.merit_of_all)))
         if self.settings.drop_idle:
             theta = without_idle(self.evaluation, space, theta, [*added, *common])
         return np.tile(theta, (n, 1))
+
+    def _at_corners(self, search: _RangeSearch, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """From a point to one that keeps the limits at the corners of the range too."""
+        loop, settings = self.evaluation.loop, self.settings
+        corners = list(loop.draw(settings.corners, self.seed, extreme=settings.extreme)) if settings.corners else []
+        for _ in range(CORNER_ROUNDS):
+            violations = [search.violation(u, one) for one in corners]
+            worst = [k for k in np.argsort(violations)[::-1][: settings.added] if violations[k] > 0]
+            if not worst:
+                break
+            search = search.with_rows_of([corners[k] for k in worst])
+            corners = [one for k, one in enumerate(corners) if k not in worst]
+            u = search.refine(u)
+        return u
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""
@@ -130,7 +155,7 @@ class _RangeSearch:
         margin: float,
         settings: RangeSettings,
     ) -> None:
-        self._loop, self._aim, self._space, self._settings = evaluation.loop, evaluation.aim, space, settings
+        self._evaluation, self._space, self._settings = evaluation, space, settings
         self._plants, self._added, self._margin = [*added, *common], len(added), margin
 
     def refine(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -146,22 +171,32 @@ class _RangeSearch:
         """The same on all plants."""
         return _merit(self._point(u, self._plants))
 
+    def violation(self, u: NDArray[np.float64], plant: DrawnPlant) -> float:
+        """That of the rows of one plant; inf where it has no verdict."""
+        point = self._point(u, [plant])
+        return np.inf if point is None else point.violation
+
+    def with_rows_of(self, plants: Sequence[DrawnPlant]) -> _RangeSearch:
+        """The same search with the rows of these plants too."""
+        added, common = self._plants[: self._added], self._plants[self._added :]
+        return _RangeSearch(self._evaluation, self._space, common, [*plants, *added], self._margin, self._settings)
+
     def _points(self, us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
         return [self._point(u, self._plants) for u in us]
 
     def _point(self, u: NDArray[np.float64], plants: Sequence[DrawnPlant]) -> Point | None:
         theta = self._space.from_unit(np.clip(u, 0.0, 1.0))
         rows, worth = [], []
-        for episode in self._loop.simulate([theta] * len(plants), plants):
-            score: Score | None = None if episode is None else self._loop.score(episode, metrics=False)
+        for episode in self._evaluation.loop.simulate([theta] * len(plants), plants):
+            score: Score | None = None if episode is None else self._evaluation.loop.score(episode, metrics=False)
             if episode is None or score is None:
                 return None
-            excess, _ = samples_of(score, self._loop.samples(episode), self._settings.aim)
+            excess, _ = samples_of(score, self._evaluation.loop.samples(episode), self._settings.aim)
             rows.append(excess + self._margin)
             worth.append(score.objective)
         # The worst plants of trials are no fair sample of what a theta is worth.
         common = worth[self._added :] if len(plants) == len(self._plants) else worth
-        return Point(-objective_over(self._aim, common), np.concatenate(rows))
+        return Point(-objective_over(self._evaluation.aim, common), np.concatenate(rows))
 
 
 def _merit(point: Point | None) -> float:

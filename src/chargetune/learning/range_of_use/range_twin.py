@@ -36,7 +36,9 @@ class RangeTwinLoop(RangeLoop, ModelledLoop, Protocol):
     What is of the plant is learnt, what is of the episode is drawn anew.
     """
 
-    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> Sequence[DrawnPlant]:
+    def draw(
+        self, count: int, seed: int, scores: NDArray[np.float64] | None = None, *, extreme: float | None = None
+    ) -> Sequence[DrawnPlant]:
         """As `RangeLoop.draw`; ``scores`` are what is of each plant (`RangeOfUse.draw`)."""
         ...
 
@@ -132,8 +134,8 @@ class SimulatedRangeTwin:
     def largest_of(self) -> tuple[str, ...]:
         return self.range.largest_of
 
-    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None) -> list[DrawnPlant]:
-        return self.range.draw(count, seed, scores)
+    def draw(self, count: int, seed: int, scores: NDArray[np.float64] | None = None, *, extreme: float | None = None) -> list[DrawnPlant]:
+        return self.range.draw(count, seed, scores, extreme=extreme)
 
     def simulate(self, thetas: Sequence[NDArray[np.float64]], plants: Sequence[DrawnPlant]) -> list[Episode | None]:
         return run_drawn(self._loop, self._table, thetas, plants)
