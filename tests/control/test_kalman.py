@@ -156,6 +156,27 @@ def test_outliers_are_left_out_and_counted_and_what_lasts_is_taken():
     assert np.linalg.norm(found[-1][0] - wanted[-1][0]) < 0.2 * np.linalg.norm(wanted[-1][0])
 
 
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_on_the_side_that_is_believed_an_outlier_counts_as_one_at_the_gate(iterations):
+    """The textbook filter, told the gate of the tenth sample; the next one beyond is taken whole. On the other side it is left out."""
+    own, noise, c = linear(), SD[0] ** 2, C[:1]
+    estimator = ExtendedKalman(("y",), SD[:1], PROCESS, START, gate_sd=5.0, rejections_max=1, believed="above", iterations=iterations)
+    for sign in (1.0, -1.0):
+        measurements = np.random.default_rng(0).normal(0, 0.1, size=(14, 1))
+        measurements[[10, 11]] += 50.0 * sign
+        x, covariance = np.zeros(2), np.diag(np.square(START))
+        for k, (x_hat, memory) in enumerate(run(estimator, own, measurements, np.zeros(14))):
+            variance = float((c @ covariance @ c.T)[0, 0] + noise)
+            y = float((c @ x)[0]) + 5.0 * variance**0.5 if k == 10 else measurements[k, 0]
+            if k != 10 or sign > 0:
+                gain = (covariance @ c.T)[:, 0] / variance
+                x, covariance = x + gain * (y - float((c @ x)[0])), (np.eye(2) - np.outer(gain, c)) @ covariance
+            np.testing.assert_allclose(x_hat, x, atol=1e-9)
+            np.testing.assert_allclose(memory.covariance, covariance, atol=1e-9)
+            x, covariance = A @ x, A @ covariance @ A.T + np.diag(np.square(PROCESS))
+        assert memory.rejected[0] == (sign < 0)
+
+
 def settable(**values):
     return Model.build(
         "settable",
@@ -299,6 +320,7 @@ def test_the_memory_is_part_of_a_control_step():
         (lambda: ExtendedKalman(("y",), (0.1,), (-1, 0), (1, 1)), ["process_sd", ">= 0"]),
         (lambda: ExtendedKalman(("y",), (0.1,), (1, 0), (float("nan"), 1)), ["start_sd", ">= 0"]),
         (lambda: ExtendedKalman(("y",), (0.1,), (0, 0), (1, 1), gate_sd=0.0), ["gate_sd", "> 0"]),
+        (lambda: ExtendedKalman(("y",), (0.1,), (0, 0), (1, 1), believed="up"), ["believed = 'up'", "'above', 'below' or None"]),
         (lambda: ExtendedKalman(("y",), (0.1,), (0, 0), (1, 1), iterations=0), ["iterations = 0", ">= 1"]),
         (lambda: ExtendedKalman(("y",), (0.1,), (0, 0), (1, 1), rejections_max=True), ["rejections_max = True", ">= 1"]),
         (lambda: ExtendedKalman(("y",), (0.1,), ("drift", 0), (1, 1)).signals(linear()), ["process_sd", "'drift'", "scalar parameters"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -38,6 +38,14 @@ class FilterMemory(NamedTuple):
     lost: Any
 
 
+class _Gate(NamedTuple):
+    """Of one sample: whether it is inside the gate, whether it is on the side that is believed, and the gate on that side."""
+
+    inside: Any
+    believed: Any
+    at: Any
+
+
 @dataclass(frozen=True)
 class ExtendedKalman:
     """Extended Kalman filter on the ``measured`` outputs of the controller's model.
@@ -59,6 +67,10 @@ class ExtendedKalman:
         A sample further from its prediction than so many standard deviations sqrt(C P C' + R) of the innovation is left out, as one
         that is not finite always is. None, the default: no gate, since a filter without a disturbance model takes model errors of
         tens of its standard deviations for outliers. 5 is usual with one.
+    believed
+        "above" or "below": a sample outside the gate on this side of its prediction is not left out, but counts as one at the gate. This is
+        for the side on which a limit lies: there a sample that is left out would let the input go on rising. Limiting an innovation is
+        what a robust filter does with all of them (Masreliez and Martin, IEEE TAC 22 (1977) 361).
     rejections_max
         After so many in a row the next ones are taken until one is inside the gate again: what lasts is no outlier, even where
         process_sd is 0 and P does not grow.
@@ -76,6 +88,7 @@ class ExtendedKalman:
     iterations: int = 1
     gate_sd: Setting | None = None
     rejections_max: int = 10
+    believed: Literal["above", "below"] | None = None
     first: Callable[[Mapping[str, Any], Named], Mapping[str, Any]] | None = None
 
     def __post_init__(self) -> None:
@@ -91,6 +104,8 @@ class ExtendedKalman:
             strict = name in ("measurement_sd", "gate_sd")
             if not all(math.isfinite(v) and (v > 0.0 if strict else v >= 0.0) for v in values):
                 raise ValueError(f"estimator: {name} = {list(values)}, allowed are finite numbers {'>' if strict else '>='} 0")
+        if self.believed not in (None, "above", "below"):
+            raise ValueError(f"estimator: believed = {self.believed!r}, allowed is 'above', 'below' or None")
         for name in ("iterations", "rejections_max"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -163,18 +178,22 @@ class ExtendedKalman:
         known = [finite(y[name]) for name in self.measured]
         inside: list[Any] = []
         used: list[Any] = []
+        taken: list[Any] = []
         for _ in range(self.iterations):
             values, rows = ca.substitute([outputs, ca.jacobian(outputs, at)], [at], [x])
             around, x, spread = x, prior, covariance
             if not used:
-                inside = self._inside(y, named, values, rows, covariance, noise)
-                late = [before.in_a_row[j] >= self.rejections_max for j in range(len(known))]
-                used = [ca.logic_and(k, ca.logic_or(i, late_one)) for k, i, late_one in zip(known, inside, late, strict=True)]
-            for j, name in enumerate(self.measured):
+                gates = self._gates(y, named, values, rows, covariance, noise)
+                inside = [one.inside for one in gates]
+                for j, one in enumerate(gates):
+                    whole = ca.logic_or(one.inside, before.in_a_row[j] >= self.rejections_max)
+                    taken.append(ca.if_else(whole, y[self.measured[j]], one.at))
+                    used.append(ca.logic_and(known[j], ca.logic_or(whole, one.believed)))
+            for j in range(len(self.measured)):
                 row = rows[j, :]
                 towards = ca.mtimes(spread, row.T)
                 gain = ca.if_else(used[j], 1, 0) * towards / (ca.mtimes(row, towards) + noise[j])
-                innovation = y[name] - values[j] - ca.mtimes(row, x - around)
+                innovation = taken[j] - values[j] - ca.mtimes(row, x - around)
                 x = x + gain * ca.if_else(used[j], innovation, 0)
                 # Joseph's form: the covariance stays positive whatever rounding does to the gain.
                 half = spread - ca.mtimes(gain, towards.T)
@@ -193,15 +212,18 @@ class ExtendedKalman:
         ahead = ca.mtimes([transition, before.covariance, transition.T]) + ca.diag(process)
         return ca.vertcat(model.f(x_hat, u, p), _lower(ahead), before.step, before.in_a_row, before.rejected, before.lost)
 
-    def _inside(
+    def _gates(
         self, y: Mapping[str, Any], named: tuple[Named, Named], values: Any, rows: Any, covariance: Any, noise: list[Any]
-    ) -> list[Any]:
-        """Whether each sample is inside the gate."""
+    ) -> list[_Gate]:
+        """The gate of each measured output."""
         if self.gate_sd is None:
-            return [1] * len(self.measured)
-        (gate,) = self.values("gate_sd", *named)
-        variances = [ca.mtimes([rows[j, :], covariance, rows[j, :].T]) + noise[j] for j in range(len(self.measured))]
-        return [(y[n] - values[j]) ** 2 <= gate**2 * variances[j] for j, n in enumerate(self.measured)]
+            return [_Gate(1, 0, 0.0)] * len(self.measured)
+        (width,), out = self.values("gate_sd", *named), []
+        sign = {"above": 1.0, "below": -1.0, None: 0.0}[self.believed]
+        for j, name in enumerate(self.measured):
+            off, variance = y[name] - values[j], ca.mtimes([rows[j, :], covariance, rows[j, :].T]) + noise[j]
+            out.append(_Gate(off**2 <= width**2 * variance, sign * off > 0, values[j] + sign * width * ca.sqrt(variance)))
+        return out
 
     def _first(self, model: Model, prior: Any, y: Mapping[str, Any], p: Named, begins: Any) -> Any:
         given = self.first(y, p) if self.first is not None else {}

@@ -17,6 +17,7 @@ from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.ringing import check_ringing
 from chargetune.battery.charging.settings import EstimatorSettings
 from chargetune.battery.charging.tunables import CurrentRamp, ObserverSetting
+from chargetune.battery.plants.circuit import Circuit
 from chargetune.battery.studies.study_file import load_config
 from chargetune.control.riccati import steady_filter
 from chargetune.episode.stepwise import run_episode
@@ -55,6 +56,18 @@ def test_feedback_removes_most_of_what_a_wrong_model_does(seed, oracle):
     assert adaptive["overshoot_mV"] < 10.0
     for found in (fast, adaptive):
         assert found["t95_min"] < 1.01 * oracle["t95_min"]
+
+
+@pytest.mark.parametrize(("factor", "start_sd", "most_V"), [(1.5, 0.3, 0.025), (2.0, 0.1, 0.025)])
+def test_a_voltage_far_above_its_prediction_is_no_outlier(factor, start_sd, most_V):
+    """Left out as one, the current rises in the next interval: 56 and 256 mV over the limit. The first interval nothing can prevent."""
+    tables = {name: tuple(factor * r for r in getattr(CELL, name)) for name in ("R0_ohm", "R1_ohm")}
+    own = problem(
+        "adaptive", None, adaptive=Adaptive(resistance_start_sd=start_sd), plant=Circuit(replace(CELL, **tables)),
+        soc_start=0.3, steps=60, voltage_noise_sd_V=0.002,
+    )  # fmt: skip
+    voltage = np.maximum(*run_charge(own).noise_free().signal("voltage_V"))
+    assert voltage[1:].max() < own.voltage_max_V + most_V
 
 
 def test_the_default_backoff_keeps_the_limit_under_noise(oracle):

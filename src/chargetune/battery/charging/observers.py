@@ -93,8 +93,9 @@ class Adaptive:
         As in `OffsetFree`.
 
     gate_sd
-        A sample further off than so many standard deviations of the innovation is left out, but never two in a row: a resistance four times
-        as large as believed looks like an outlier in every sample, and while they are left out the current goes on rising.
+        A sample further below its prediction than so many standard deviations of the innovation is left out, but never two in a row; one
+        further above counts as one at the gate. A resistance four times as large as believed looks like an outlier in every sample, and
+        where such samples are left out the current goes on rising.
     """
 
     soc: Literal["counted", "measured", "estimated"] = "estimated"
@@ -132,7 +133,7 @@ class Adaptive:
     temperature_drift_K: float = 0.5
     """What a minute adds to the temperature, standard deviation."""
     gate_sd: float | None = 5.0
-    """A sample further off than so many standard deviations is left out, but never two in a row."""
+    """A sample further below its prediction is left out, but never two in a row; one further above counts as at the gate."""
 
     def __post_init__(self) -> None:
         _check("adaptive", self, ("counted", "measured", "estimated"))
@@ -194,7 +195,7 @@ def observer_filter(cell: Cell, model: Model, observer: Observer) -> ExtendedKal
     first = partial(_first_sample, cell=cell, soc_from_rest=observer.soc_from_rest, soc_measured=observer.soc == "measured")
     gate = None if observer.gate_sd is None else "gate_sd"
     return ExtendedKalman.of(
-        model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, rejections_max=1, first=first
+        model, measurement_sd=measurement, process_sd=process, start_sd=start, gate_sd=gate, rejections_max=1, believed="above", first=first
     )
 
 
