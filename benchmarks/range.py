@@ -38,7 +38,7 @@ from chargetune.battery.charging.verdict import score_episode
 from chargetune.battery.plants.steppable import as_steppable
 from chargetune.battery.studies.study_file import TwinTable, load_config
 from chargetune.episode.compiled import compiled_episode
-from chargetune.learning import RangeSettings, RangeTwinSettings, RangeTwinTuner, Safety, TwinSettings
+from chargetune.learning import RangeSettings, RangeTwinSettings, RangeTwinTuner, Safety
 from chargetune.plants.range_of_use import DrawnPlant
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -68,7 +68,7 @@ def settings_of(options):
     """Of the search, with the parts that are taken away."""
     first = RangeSettings(plants=options.plants, pool=16, iterations=options.iterations)
     later = RangeSettings(plants=options.plants * 2 // 3, pool=8, iterations=options.iterations)
-    rounds, twin = options.rounds, TwinSettings()
+    rounds, twin = options.rounds, RangeTwinSettings().twin
     if "margin" in options.without:
         first, later, rounds = replace(first, aim=1.0, corners=0), replace(later, aim=1.0, corners=0), 1
     if "discrepancy" in options.without:

@@ -126,22 +126,24 @@ def test_the_mean_is_that_of_textbook_algebra():
     """K W' (W K W' + N)^-1 r for the residuals r of the mode, with the nodes' covariance K that the process states."""
     ensemble, _trials = conditioned((3.0, 1.7))
     found = ensemble.discrepancy
-    mode, data, (prior,) = found.posterior.mode, found.data, found._priors
+    mode, data, (prior,) = found.posterior.mode, found.data, found.priors
     left = found._residuals(mode)[:, 0]
     expected = prior @ data.weights.T @ np.linalg.solve(data.weights @ prior @ data.weights.T + np.diag(data.variance[:, 0]), left)
     np.testing.assert_allclose(found.mean(mode).table[0], expected, atol=1e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 6.3])
-def test_samples_have_the_mean_and_the_covariance_of_the_process_of_their_scale(scale):
-    """Monte Carlo of 600 samples, against the covariance that is built and factorised directly."""
-    ensemble, _ = conditioned((3.0, 1.7))
+@pytest.mark.parametrize(("scale", "own"), [(0.1, 0.0), (1.0, 0.0), (6.3, 0.0), (1.0, 0.3)])
+def test_samples_have_the_mean_and_the_covariance_of_the_process_of_their_scale(scale, own):
+    """Monte Carlo of 600 samples, against the covariance that is built and factorised directly; a sample has an own part of its own."""
+    ensemble, _ = conditioned((3.0, 1.7), of_episode=own)
     found = ensemble.discrepancy
-    prior, data, mode = scale**2 * found._priors[0], found.data, found.posterior.mode
-    seen = cho_factor(data.weights @ prior @ data.weights.T + np.diag(data.variance[:, 0]))
+    prior, data, mode, ratio = scale**2 * found.priors[0], found.data, found.posterior.mode, found.fitted[0].ratio
+    assert (ratio > 0) == (own > 0)
+    of_one = np.where(data.episode[:, None] == data.episode, 1.0 + ratio, 1.0)
+    seen = cho_factor(of_one * (data.weights @ prior @ data.weights.T) + np.diag(data.variance[:, 0]))
     gain = cho_solve(seen, data.weights @ prior).T
     weights = found.lookup_table.weights(found.at(WRONG.episode(np.full(3, 1.3), 1)))
-    covariance = weights @ (prior - gain @ data.weights @ prior) @ weights.T
+    covariance = weights @ ((1.0 + ratio) * prior - gain @ data.weights @ prior) @ weights.T
     mean = weights @ gain @ found._residuals(mode)[:, 0]
     drawn = np.array([s.table[0] @ weights.T for s in found.samples(np.tile(mode, (600, 1)), scale, range(600))])
     sd = np.sqrt(np.diag(covariance))
@@ -159,8 +161,8 @@ def test_samples_of_several_plants_are_those_of_one_after_the_other():
         np.testing.assert_allclose(one.table, alone.table, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_variances_of_every_scale_are_those_of_directly_built_covariances(seed):
+@pytest.mark.parametrize(("seed", "ratio"), [(0, 0.0), (1, 0.0), (2, 0.4)])
+def test_variances_of_every_scale_are_those_of_directly_built_covariances(seed, ratio):
     draw = np.random.default_rng(seed)
     nodes, count, ahead = 12, 7, 9
     half = draw.standard_normal((nodes, nodes))
@@ -168,15 +170,28 @@ def test_variances_of_every_scale_are_those_of_directly_built_covariances(seed):
     weights, other = (draw.dirichlet(np.ones(nodes), n) for n in (count, ahead))
     variance = draw.uniform(0.01, 0.2, count)
     scales = np.array([0.1, 0.7, 1.0, 3.0, 10.0])
-    found = _part(prior, variance, weights).variances(other, scales)
+    together = (np.arange(count)[:, None] // 3 == np.arange(count) // 3).astype(float)
+    found = _part(prior, ratio, variance, weights, together).variances(other, scales)
     for scale, own in zip(scales, found, strict=True):
         k = scale**2 * prior
-        seen = cho_factor(weights @ k @ weights.T + np.diag(variance))
-        expected = np.diag(other @ (k - k @ weights.T @ cho_solve(seen, weights @ k)) @ other.T)
+        seen = cho_factor(weights @ k @ weights.T * (1.0 + ratio * together) + np.diag(variance))
+        expected = np.diag(other @ ((1.0 + ratio) * k - k @ weights.T @ cho_solve(seen, weights @ k)) @ other.T)
         np.testing.assert_allclose(own, expected, rtol=1e-5)
         # And those of the part that samples of this scale are drawn by.
-        part = _part(k, variance, weights)
+        part = _part(k, ratio, variance, weights, together)
         np.testing.assert_allclose(np.sum((other @ part.root) ** 2, axis=1), expected, rtol=1e-5)
+
+
+def test_what_is_of_an_episode_is_drawn_anew():
+    """Each episode has an error of 0.03 of its own sign. Without an own part every plant has that of the traces, and is sure of it."""
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], 5)
+    trials = [Plant(unmodelled=lambda level, _, s=s: 0.03 * s + 0.0 * level).trial(k, np.full(3, 2.0)) for k, s in enumerate(signs)]
+    for own, least, most in ((0.1, 0.02, 0.1), (0.0, 0.0, 0.005)):
+        learnt = condition(ToyLoop(), trials, TwinSettings(of_episode=own)).learnt
+        found = learnt.discrepancy
+        weights = found.lookup_table.weights(found.at(trials[0].episode()))
+        drawn = [weights @ one.table[0] for one in found.samples(np.tile(found.posterior.mode, (64, 1)), learnt.scale, range(64))]
+        assert least <= np.mean(np.std(drawn, axis=0)) < most, own
 
 
 def test_a_factor_of_a_covariance_that_rounding_left_indefinite():
@@ -199,7 +214,7 @@ def test_where_no_hyperparameters_are_found_they_are_the_prior_medians_and_nothi
     nodes = draw.uniform(size=(1, 6, 2))
     before = torch.random.get_rng_state()
     with pytest.warns(SurrogateWarning, match="the discrepancy of the twin in 20 bins could not be fitted"):
-        (found,) = _fit(x, left, variance, nodes, settings)
+        (found,) = _fit(x, np.zeros(20, dtype=int), left, variance, nodes, settings)
     assert torch.equal(torch.random.get_rng_state(), before)
     distance = np.sqrt(3.0) * np.linalg.norm((nodes[0, :, None] - nodes[0]) / settings.length_scales[:2], axis=-1)
     np.testing.assert_allclose(found.kernel, (1 + distance) * np.exp(-distance), atol=1e-6)

@@ -129,9 +129,10 @@ def test_what_happened_is_known_better_than_what_would_happen():
     assert worst.std() < NOISE
 
 
-def test_what_was_learnt_before_changes_nothing_that_is_said(monkeypatch):
+@pytest.mark.parametrize("own", [0.0, 0.1])
+def test_what_was_learnt_before_changes_nothing_that_is_said(monkeypatch, own):
     """After more trials than it learns from, and after other studies have gone through the same memory."""
-    plant, settings = Plant(), TwinSettings(traces=2)
+    plant, settings = Plant(), TwinSettings(traces=2, of_episode=own)
     trials = [plant.trial(k, np.full(3, level)) for k, level in enumerate((3.0, 2.5, 2.0, 1.7))]
     for n in (1, 2, 3, 4):
         condition(ToyLoop(), trials[:n], settings)
@@ -139,7 +140,7 @@ def test_what_was_learnt_before_changes_nothing_that_is_said(monkeypatch):
     for known in (trials[:2], trials):
         warm = condition(ToyLoop(), known, settings)
         with monkeypatch.context() as patched:
-            for name in ("_LEARNT", "_CHECKED"):
+            for name in ("_FITTED", "_LEARNT", "_CHECKED"):
                 patched.setattr(f"chargetune.learning.twin.ensemble.{name}", Nothing())
             fresh = condition(ToyLoop(), known, settings)
         np.testing.assert_array_equal(warm.discrepancy.posterior.mode, fresh.discrepancy.posterior.mode)

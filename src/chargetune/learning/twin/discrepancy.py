@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from botorch.models import SingleTaskGP
+from botorch.models.kernels import CategoricalKernel
 from gpytorch.kernels import MaternKernel, ScaleKernel
 from gpytorch.means import ZeroMean
 from gpytorch.priors import LogNormalPrior
@@ -46,8 +48,12 @@ class Discrepancy:
     residuals, so that every sampled plant passes through what was measured, and they part where nothing was.
     k is known at the nodes of a table and linear in between, k(s, s') = w(s)' K w(s') with the shares w of the nodes around s, so
     that a sample drawn at the nodes is one of this process (Wilson and Nickisch, ICML 2015).
+    With ``TwinSettings.of_episode`` each episode has a part of its own, b_i(s) + c_ie(s), c_ie ~ GP(0, r a_i^2 k) for each episode e: what
+    depends on where the episode began, or on what came before it. It is learnt how large that part is, never what it is: a sample has a
+    new one.
     ``scale`` multiplies the standard deviation of the whole process: how far what is stated can be trusted (`calibration`).
-    Hyperparameters: maximum a posteriori of the residuals at the mode (BoTorch), log-normal priors.
+    Hyperparameters: maximum a posteriori of the residuals at the mode (BoTorch), log-normal priors; with ``fitted_by`` those of that one,
+    of the same features and outputs.
     Source: Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425.
     """
 
@@ -55,6 +61,7 @@ class Discrepancy:
     episodes: tuple[Episode, ...]
     features: Mapping[str, tuple[float, float]]
     settings: TwinSettings = field(default_factory=TwinSettings)
+    fitted_by: Discrepancy | None = None
 
     def __post_init__(self) -> None:
         most = len(self.settings.length_scales)
@@ -86,7 +93,11 @@ class Discrepancy:
 
     def _scaled(self, scale: float) -> tuple[_Part, ...]:
         data = self.data
-        return tuple(_part(scale**2 * prior, data.variance[:, i], data.weights) for i, prior in enumerate(self._priors))
+        together = (data.episode[:, None] == data.episode).astype(float)
+        return tuple(
+            _part(scale**2 * prior, one.ratio, data.variance[:, i], data.weights, together)
+            for i, (prior, one) in enumerate(zip(self.priors, (self.fitted_by or self).fitted, strict=True))
+        )
 
     @cached_property
     def lookup_table(self) -> LookupTable:
@@ -124,9 +135,10 @@ class Discrepancy:
     def data(self) -> _Data:
         twin = self.posterior.twin
         counts = np.concatenate([binned_residuals(measured(twin, e), self.settings.bins)[1] for e in self.episodes])
-        at = np.concatenate([self.at(episode) for episode in self.episodes])
+        each = [self.at(episode) for episode in self.episodes]
+        at, episode = np.concatenate(each), np.repeat(np.arange(len(each)), [len(one) for one in each])
         noise = np.array(list(twin.noise_sd.values()))
-        return _Data(self.lookup_table.unit(at), self.lookup_table.weights(at), noise**2 / np.maximum(counts, 1e-9))
+        return _Data(self.lookup_table.unit(at), self.lookup_table.weights(at), noise**2 / np.maximum(counts, 1e-9), episode)
 
     @cached_property
     def _inputs(self) -> NDArray[np.bool_]:
@@ -141,11 +153,13 @@ class Discrepancy:
     def fitted(self) -> tuple[_Fitted, ...]:
         left, data = self._residuals(self.posterior.mode), self.data
         on = np.array([np.where(self._inputs & self._inert(name), 0.0, 1.0) for name in self.posterior.twin.noise_sd])[:, None]
-        return _fit(data.at * on, left.T, data.variance.T, self.lookup_table.nodes * on, self.settings)
+        return _fit(data.at * on, data.episode, left.T, data.variance.T, self.lookup_table.nodes * on, self.settings)
 
     @cached_property
-    def _priors(self) -> tuple[NDArray[np.float64], ...]:
+    def priors(self) -> tuple[NDArray[np.float64], ...]:
         """Covariance of each output at the nodes with the scale 1."""
+        if self.fitted_by is not None:
+            return self.fitted_by.priors
         twin, nodes, inputs = self.posterior.twin, self.lookup_table.nodes, self._inputs
         low, high = np.array(list(self.features.values())).T
         sizes = np.abs(self.lookup_table.value(nodes)) / np.maximum(np.abs(low), np.abs(high))
@@ -188,6 +202,8 @@ class _Data(NamedTuple):
     """Values at the nodes -> values there, shape (bins, nodes)."""
     variance: NDArray[np.float64]
     """Variance of the mean residual by noise, shape (bins, outputs)."""
+    episode: NDArray[np.int_]
+    """Of which episode each is, shape (bins,)."""
 
 
 class _Fitted(NamedTuple):
@@ -196,17 +212,20 @@ class _Fitted(NamedTuple):
     kernel: NDArray[np.float64]
     """Correlation of the nodes, shape (nodes, nodes)."""
     variance: float
+    ratio: float
+    """Variance of an episode's own part, to that of the common one."""
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One output: residuals -> mean at the nodes, prior covariance at the nodes, and what of it the data take away."""
+    """One output: residuals -> mean at the nodes, prior covariance at the nodes of one episode, and what of it the data take away."""
 
     gain: NDArray[np.float64]
     prior: NDArray[np.float64]
     cross: NDArray[np.float64]
     noise: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    """Covariance of the data without noise."""
 
     def prior_variance(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Before anything was measured, with ``weights`` of the nodes (K, nodes), shape (K,)."""
@@ -218,7 +237,7 @@ class _Part:
         With W the noise of the data and W^-1/2 K W^-1/2 = U diag(a) U' it is s^2 k - s^4 |diag(s^2 a + 1)^-1/2 U' W^-1/2 c|^2.
         """
         white = 1.0 / np.sqrt(self.noise)
-        values, vectors = np.linalg.eigh(white[:, None] * (self.cross @ self.weights.T) * white)
+        values, vectors = np.linalg.eigh(white[:, None] * self.seen * white)
         across = (vectors.T @ (white[:, None] * (self.cross @ weights.T))) ** 2
         square = scales[:, None] ** 2
         taken = square**2 * (1.0 / (square * np.maximum(values, 0.0) + 1.0)) @ across
@@ -239,13 +258,15 @@ class _Part:
 
 def _fit(
     x: NDArray[np.float64],
+    episode: NDArray[np.int_],
     left: NDArray[np.float64],
     variance: NDArray[np.float64],
     nodes: NDArray[np.float64],
     settings: TwinSettings,
 ) -> tuple[_Fitted, ...]:
-    """One process an output, all at once: x (outputs, n, d), residuals and their variance by noise (outputs, n), nodes (outputs, K, d).
+    """One process an output, all at once.
 
+    Shapes: x (outputs, n, d), the episode of each (n,), residuals and their variance by noise (outputs, n), nodes (outputs, K, d).
     Where no hyperparameters can be found they are the medians of their priors, and a `SurrogateWarning` says so. A second attempt begins
     at a draw of them: of its own seed, so that the same residuals give the same process.
     """
@@ -254,14 +275,20 @@ def _fit(
     count, _, d = x.shape
     batch = torch.Size([count])
     medians = np.array(settings.length_scales[:d])
+    inputs = torch.as_tensor(x / medians)
+    if settings.of_episode:
+        inputs = torch.cat([inputs, torch.as_tensor(episode, dtype=inputs.dtype).expand(count, -1)[..., None]], dim=-1)
 
     def fresh() -> SingleTaskGP:
         # In units of their prior medians all length scales have the same prior.
-        kernel = MaternKernel(nu=1.5, ard_num_dims=d, lengthscale_prior=LogNormalPrior(0.0, settings.length_scale_sd), batch_shape=batch)
-        scaled = ScaleKernel(kernel, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
-        kernel.lengthscale, scaled.outputscale = 1.0, 1.0
+        prior = LogNormalPrior(0.0, settings.length_scale_sd)
+        kernel = MaternKernel(nu=1.5, ard_num_dims=d, active_dims=tuple(range(d)), lengthscale_prior=prior, batch_shape=batch)
+        kernel.lengthscale = 1.0
+        whole = kernel + _own(kernel, settings.of_episode) if settings.of_episode else kernel
+        scaled = ScaleKernel(whole, outputscale_prior=LogNormalPrior(0.0, 1.0), batch_shape=batch)
+        scaled.outputscale = 1.0
         return SingleTaskGP(
-            torch.as_tensor(x / medians), torch.as_tensor(left / sizes)[..., None],
+            inputs, torch.as_tensor(left / sizes)[..., None],
             torch.as_tensor(np.minimum(variance / sizes**2, 1e6))[..., None],
             covar_module=scaled, mean_module=ZeroMean(),
             outcome_transform=None, input_transform=None,
@@ -270,14 +297,32 @@ def _fit(
     with reproducible(0):
         scaled: Any = fitted(fresh, f"the discrepancy of the twin in {x.shape[1]} bins", attempts=ATTEMPTS).covar_module
         with torch.no_grad():
-            kernels, scales = scaled.base_kernel(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
-    return tuple(_Fitted(k, float(size**2 * scale)) for k, size, scale in zip(kernels, sizes[:, 0], scales, strict=True))
+            common, own = scaled.base_kernel.kernels if settings.of_episode else (scaled.base_kernel, None)
+            kernels, scales = common(torch.as_tensor(nodes / medians)).to_dense().numpy(), scaled.outputscale.numpy()
+            ratios = np.zeros(count) if own is None else own.outputscale.numpy()
+    found = zip(kernels, sizes[:, 0], scales, ratios, strict=True)
+    return tuple(_Fitted(kernel, float(size**2 * scale), float(ratio)) for kernel, size, scale, ratio in found)
 
 
-def _part(prior: NDArray[np.float64], variance: NDArray[np.float64], weights: NDArray[np.float64]) -> _Part:
+def _own(common: MaternKernel, median: float) -> ScaleKernel:
+    """r k(s, s') [e = e'], with e the column behind those of ``common``; its length scales are those of that one."""
+    same = CategoricalKernel(active_dims=(common.ard_num_dims,), batch_shape=common.batch_shape)
+    # exp(-1 / 0.01): another episode has nothing of it.
+    same.lengthscale = 0.01
+    same.raw_lengthscale.requires_grad_(requires_grad=False)
+    own = ScaleKernel(common * same, outputscale_prior=LogNormalPrior(math.log(median), 1.0), batch_shape=common.batch_shape)
+    own.outputscale = median
+    return own
+
+
+def _part(
+    prior: NDArray[np.float64], ratio: float, variance: NDArray[np.float64], weights: NDArray[np.float64], together: NDArray[np.float64]
+) -> _Part:
+    """``together``: 1 for two bins of one episode, else 0."""
     cross, noise = weights @ prior, variance + JITTER * prior[0, 0]
-    seen = cho_factor(cross @ weights.T + np.diag(noise), lower=True)
-    return _Part(cho_solve(seen, cross).T, prior, cross, noise, weights)
+    seen = cross @ weights.T * (1.0 + ratio * together)
+    factor = cho_factor(seen + np.diag(noise), lower=True)
+    return _Part(cho_solve(factor, cross).T, (1.0 + ratio) * prior, cross, noise, seen)
 
 
 def _features(episode: Episode, names: Iterable[str], predicted: Mapping[str, NDArray[np.float64]] | None = None) -> NDArray[np.float64]:

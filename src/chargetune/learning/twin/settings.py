@@ -20,6 +20,9 @@ class TwinSettings:
     length_scales, length_scale_sd
         Prior medians of the discrepancy's length scales, as shares of each feature's range, and the sd of their logarithms. The first
         feature is the one along which the plant moves (a state of charge): its scale is short.
+    of_episode
+        Prior median of the variance of an episode's own part of the discrepancy, to that of the common one; the sd of its logarithm is 1.
+        0: there is none, which is right where all episodes begin alike.
     scale_sd
         Prior sd of the logarithm of the discrepancy's scale: before a prediction was checked the stated sd may be wrong by e.
     scale_share
@@ -52,6 +55,7 @@ class TwinSettings:
     correlated_bins: float = 4.0
     length_scales: tuple[float, ...] = (0.15, 0.5, 0.5)
     length_scale_sd: float = 0.5
+    of_episode: float = 0.0
     scale_sd: float = 1.0
     scale_share: float = 0.84
     plants: int = 64
@@ -75,6 +79,8 @@ class TwinSettings:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
                 raise ValueError(f"twin settings: {name} = {value!r}, allowed is a number > 0")
+        if isinstance(self.of_episode, bool) or not isinstance(self.of_episode, (int, float)) or not 0 <= self.of_episode < float("inf"):
+            raise ValueError(f"twin settings: of_episode = {self.of_episode!r}, allowed is a number >= 0")
         for name in ("scale_share", "aim", "proximal"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
