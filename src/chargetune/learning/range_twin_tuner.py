@@ -175,7 +175,8 @@ class RangeTwinTuner:
             return Proposed(tuple(last), Choice.REPEATED, share, why)
         theta, kept, worth = self._search(space, ConditionedRange.of(self.loop, learnt, last), self.settings.later, number)
         for demanded in (self._surely, self.safety.probability):
-            if kept >= demanded and (share < demanded or worth > value):
+            # A last one that keeps the stated share is not given up for one that is surer and slower.
+            if kept >= demanded and (share < self.safety.probability or worth > value):
                 return Proposed(theta, Choice.CONDITIONED, kept)
             if share >= demanded:
                 return Proposed(tuple(last), Choice.REPEATED, share)
