@@ -42,7 +42,7 @@ RANGE = ct.RangeOfUse(
 )
 LIMITS = (ct.ScoredLimit("T", upper=LIMIT, tolerance=5e-3),)
 LOOP = ct.SimulatedRangeTwin(ct.SimulatedRange(BLIND, RANGE, STEPS, LIMITS, lambda e: float(np.mean(e.signal("T")[1]))))
-FEW = ct.RangeSettings(plants=8, added=4, pool=4, iterations=8)
+FEW = ct.RangeSettings(plants=8, added=4, pool=4, corners=4, iterations=8)
 SETTINGS = ct.RangeTwinSettings(rounds=2, judges=150, first=FEW, later=replace(FEW, pool=0))
 TUNER = ct.RangeTwinTuner(LOOP, settings=SETTINGS)
 
