@@ -78,6 +78,10 @@ def test_a_corner_that_no_draw_came_near_is_kept():
     assert found[0] > 1.02 * best
     # A share of 0.005 of each number is farther out, and half the tolerance is used.
     assert found[8] == pytest.approx(best, rel=3e-3)
+    # The draws alone would put it back to what they allow, the corners do not.
+    space = ct.ParameterSpace((ct.Parameter("power", 0.05, 2.0, default=0.995 * found[0]),))
+    ((kept,),) = ct.RangeTuner(evaluation, seed=0, settings=replace(few, corners=8, drop_idle=True)).ask(space, [])
+    assert kept < 1.01 * best
 
 
 def test_a_violation_that_does_not_change_with_theta_is_left_behind():

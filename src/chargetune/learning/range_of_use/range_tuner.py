@@ -105,13 +105,14 @@ class RangeTuner:
         # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
         starts = (last, self._start(space, search, last)) if self.settings.pool else (last,)
         found = [search.refine(start) for start in {u.tobytes(): u for u in starts}.values()]
-        theta = space.from_unit(self._at_corners(search, min(found, key=search.merit_of_all)))
+        search, u = self._at_corners(search, min(found, key=search.merit_of_all))
+        theta = space.from_unit(u)
         if self.settings.drop_idle:
-            theta = without_idle(self.evaluation, space, theta, [*added, *common])
+            theta = without_idle(self.evaluation, space, theta, search.plants)
         return np.tile(theta, (n, 1))
 
-    def _at_corners(self, search: _RangeSearch, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """From a point to one that keeps the limits at the corners of the range too."""
+    def _at_corners(self, search: _RangeSearch, u: NDArray[np.float64]) -> tuple[_RangeSearch, NDArray[np.float64]]:
+        """From a point to one that keeps the limits at the corners of the range too, and the search that has them."""
         loop, settings = self.evaluation.loop, self.settings
         corners = list(loop.draw(settings.corners, self.seed, extreme=settings.extreme)) if settings.corners else []
         for _ in range(CORNER_ROUNDS):
@@ -122,7 +123,7 @@ class RangeTuner:
             search = search.with_rows_of([corners[k] for k in worst])
             corners = [one for k, one in enumerate(corners) if k not in worst]
             u = search.refine(u)
-        return u
+        return search, u
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""
@@ -156,7 +157,7 @@ class _RangeSearch:
         settings: RangeSettings,
     ) -> None:
         self._evaluation, self._space, self._settings = evaluation, space, settings
-        self._plants, self._added, self._margin = [*added, *common], len(added), margin
+        self.plants, self._added, self._margin = [*added, *common], len(added), margin
 
     def refine(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         settings = self._settings
@@ -165,11 +166,11 @@ class _RangeSearch:
 
     def merit(self, u: NDArray[np.float64]) -> float:
         """The objective on a few plants, to be minimised, and the worst violation with a penalty."""
-        return _merit(self._point(u, self._plants[: self._settings.first]))
+        return _merit(self._point(u, self.plants[: self._settings.first]))
 
     def merit_of_all(self, u: NDArray[np.float64]) -> float:
         """The same on all plants."""
-        return _merit(self._point(u, self._plants))
+        return _merit(self._point(u, self.plants))
 
     def violation(self, u: NDArray[np.float64], plant: DrawnPlant) -> float:
         """That of the rows of one plant; inf where it has no verdict."""
@@ -178,11 +179,11 @@ class _RangeSearch:
 
     def with_rows_of(self, plants: Sequence[DrawnPlant]) -> _RangeSearch:
         """The same search with the rows of these plants too."""
-        added, common = self._plants[: self._added], self._plants[self._added :]
+        added, common = self.plants[: self._added], self.plants[self._added :]
         return _RangeSearch(self._evaluation, self._space, common, [*plants, *added], self._margin, self._settings)
 
     def _points(self, us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
-        return [self._point(u, self._plants) for u in us]
+        return [self._point(u, self.plants) for u in us]
 
     def _point(self, u: NDArray[np.float64], plants: Sequence[DrawnPlant]) -> Point | None:
         theta = self._space.from_unit(np.clip(u, 0.0, 1.0))
@@ -195,7 +196,7 @@ class _RangeSearch:
             rows.append(excess + self._margin)
             worth.append(score.objective)
         # The worst plants of trials are no fair sample of what a theta is worth.
-        common = worth[self._added :] if len(plants) == len(self._plants) else worth
+        common = worth[self._added :] if len(plants) == len(self.plants) else worth
         return Point(-objective_over(self._evaluation.aim, common), np.concatenate(rows))
 
 
