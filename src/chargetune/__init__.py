@@ -46,10 +46,10 @@ if TYPE_CHECKING:
     from chargetune.model.model import Model, Signal
     from chargetune.model.parameter_space import Parameter, ParameterSpace
     from chargetune.plants.gymnasium import GymnasiumPlant
-    from chargetune.plants.range_of_use import RangeOfUse
+    from chargetune.plants.range_of_use import OwnDraws, RangeOfUse
     from chargetune.plants.sensors import Sensors
     from chargetune.plants.simulated import SimulatedPlant
-    from chargetune.plants.variation import Choice, LogNormal, Normal, Uniform, Variation
+    from chargetune.plants.variation import Choice, LogNormal, Normal, StudentT, Uniform, Variation
     from chargetune.study.store.store import Store
     from chargetune.study.study import Study
     from chargetune.study.warm_start import Earlier
@@ -72,6 +72,7 @@ __all__ = [
     "Model",
     "NoSafeThetaError",
     "Normal",
+    "OwnDraws",
     "Parameter",
     "ParameterSpace",
     "Propagated",
@@ -94,6 +95,7 @@ __all__ = [
     "SoftLimit",
     "Stage",
     "Store",
+    "StudentT",
     "Study",
     "Trip",
     "Twin",
@@ -138,6 +140,7 @@ _MODULES = {
     "Model": "model.model",
     "NoSafeThetaError": "learning.safety",
     "Normal": "plants.variation",
+    "OwnDraws": "plants.range_of_use",
     "Parameter": "model.parameter_space",
     "ParameterSpace": "model.parameter_space",
     "Propagated": "control.estimators",
@@ -160,6 +163,7 @@ _MODULES = {
     "SoftLimit": "control.controller",
     "Stage": "control.controller",
     "Store": "study.store.store",
+    "StudentT": "plants.variation",
     "Study": "study.study",
     "Trip": "episode.episode",
     "Twin": "learning.twin.twin",

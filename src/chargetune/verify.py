@@ -157,6 +157,9 @@ def _of_range(stated: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> 
     count = len(arrays["length"])
     pairs = {"soc_start": declared.pop("soc_start") or [stated["soc_start"]] * 2, "ambient_K": declared.pop("ambient_K")}
     aging = [declared.pop("fade"), declared.pop("growth")]
+    declared.pop("node_correlation", None)
+    # Of cells of one make each number is Student's t of its own.
+    pairs["cells"] = [-math.inf, math.inf] if declared.pop("cells", None) else None
     allowed = {name: (-width, width) for name, width in declared.items() if width}
     allowed |= {name: tuple(pair) for name, pair in pairs.items() if pair} | ({"age": (0.0, 1.0)} if any(aging) else {})
     drawn = {name.removeprefix("drawn."): values for name, values in arrays.items() if name.startswith("drawn.")}

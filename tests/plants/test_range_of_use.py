@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, norm
+from scipy.special import ndtri
+from scipy.stats import kstest, norm, t
 
 from chargetune.model.model import Model, Signal
-from chargetune.plants.range_of_use import RangeOfUse
+from chargetune.plants.range_of_use import OwnDraws, RangeOfUse
 from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
-from chargetune.plants.variation import Choice, LogNormal, Normal, Uniform, Variation
+from chargetune.plants.variation import Choice, LogNormal, Normal, StudentT, Uniform, Variation
 
 MODEL = Model.build(
     "two tanks", states=(Signal("a"), Signal("b")), inputs=(Signal("u"),), outputs=(Signal("a"),),
@@ -28,12 +29,17 @@ def drawn(*variations, count=256, seed=3, **more):
         (Uniform(-2.0, 3.0), lambda v: (v + 2) / 5),
         (Normal(1.0, 0.5), norm(1.0, 0.5).cdf),
         (LogNormal(2.0, 0.3), lambda v: norm.cdf(np.log(v / 2.0) / 0.3)),
+        (StudentT(4.0), t(4.0).cdf),
     ],
 )
 def test_draws_have_the_stated_distribution(distribution, cdf):
     values = [one.values["v"][0] for one in drawn(Variation("v", distribution, parameters={"c": 1.0}))]
     # A Sobol sequence is far closer to it than random numbers of the same count, whose statistic is about 0.05.
     assert kstest(values, cdf).statistic < 0.02
+
+
+def nodes(**more):
+    return drawn(Variation("v", **({"distribution": Uniform(-0.1, 0.1), "parameters": {"r": 1.0}, "by_entry": True} | more)))
 
 
 def test_each_choice_is_as_likely():
@@ -103,6 +109,17 @@ def test_more_draws_begin_with_the_same_ones_and_other_seeds_are_others():
         (lambda: Uniform(1.0, 0.0), "lower = 1.0, allowed is at most upper = 0.0"),
         (lambda: Normal(0.0, float("nan")), "sd = nan, allowed is a finite number"),
         (lambda: LogNormal(0.0, 0.1), "median = 0.0"),
+        (lambda: StudentT(0.0), "degrees = 0.0, allowed is more than 0"),
+        (lambda: nodes(parameters={"r": (0.1, 0.2)}), "has 2 sensitivities of r, allowed is one, or one for each of its 3 entries"),
+        (lambda: nodes(parameters={"r": (0.1, 0.2, float("nan"))}), r"r\[2\] = nan, allowed is a finite number"),
+        (lambda: nodes(correlation=1.0), r"correlation = 1.0, allowed is \[0, 1\), or a matrix"),
+        (lambda: nodes(correlation=True), r"correlation = True"),
+        (lambda: nodes(by_entry=False, correlation=0.5), "correlation is given, allowed is that only with by_entry = True"),
+        (lambda: nodes(correlation=((1.0, 0.5), (0.5, 1.0))), "correlation has 2 rows, allowed is one for each of 3 numbers"),
+        (lambda: nodes(correlation=((1.0, 0.5), (0.4, 1.0))), "allowed is a symmetric matrix with ones on its diagonal"),
+        (lambda: nodes(correlation=((1.0, 2.0), (2.0, 1.0))), "has an eigenvalue -1, allowed are none below 0"),
+        (lambda: OwnDraws(PLANT, lambda _: PLANT).draw(0, 1), "count = 0, allowed is an integer >= 1"),
+        (lambda: OwnDraws(PLANT, lambda _: PLANT).draw(1, 1, scores=np.zeros(1)), "allowed are none for draws of your own"),
         (lambda: Choice(()), "allowed is at least one"),
         (lambda: Variation("v", Uniform(0, 1), starts={"a": 1.0}, by_entry=True), "by_entry = True"),
         (lambda: Variation("v", Uniform(0, 1), starts={"a": 1.0}, of="day"), "of = 'day', allowed is 'plant' or 'episode'"),
@@ -149,3 +166,70 @@ def test_corners_are_all_combinations_of_the_extremes():
     assert {v for row in values for v in row} == {-0.5, 0.5}
     with pytest.raises(ValueError, match=r"extreme = 0.5, allowed is \(0, 0.5\)"):
         use.draw(1, 0, extreme=0.5)
+
+
+def test_sensitivities_by_entry_and_in_the_exponent():
+    both = (
+        Variation("age", Uniform(0.0, 1.0), parameters={"r": (0.5, 0.0, -0.25), "c": -0.2}),
+        Variation("make", Normal(0.0, 0.3), parameters={"r": (1.0, 2.0, 0.0)}, log=True),
+    )
+    for one in drawn(*both, count=5):
+        (a,), (v,) = one.values["age"], one.values["make"]
+        blocks = dict(one.plant.model.parameters)
+        expected = np.array([1.0, 2.0, 3.0]) * (1 + a * np.array([0.5, 0.0, -0.25])) * np.exp(v * np.array([1.0, 2.0, 0.0]))
+        np.testing.assert_allclose(blocks["r"], expected)
+        np.testing.assert_allclose(blocks["c"], 4.0 * (1 - 0.2 * a))
+
+
+def test_neighbouring_entries_are_correlated_and_each_is_distributed_as_stated():
+    both = (
+        Variation("first", Uniform(0.0, 1.0), starts={"a": 1.0}),
+        Variation("v", Uniform(-0.1, 0.1), parameters={"r": 1.0, "c": 1.0}, by_entry=True, correlation=0.8),
+    )
+    draws = drawn(*both, count=4096)
+    values = np.array([one.values["v"] for one in draws])
+    for column in values.T:
+        assert kstest(column, lambda v: (v + 0.1) / 0.2).statistic < 0.02
+    # A correlation of normal scores; c has no neighbour among r.
+    found = np.corrcoef(ndtri((values + 0.1) / 0.2), rowvar=False)
+    expected = [[1, 0.8, 0.64, 0], [0.8, 1, 0.8, 0], [0.64, 0.8, 1, 0], [0, 0, 0, 1]]
+    np.testing.assert_allclose(found, expected, atol=0.03)
+    # What is not correlated is drawn as without it.
+    plain = drawn(both[0], Variation("v", Uniform(-0.1, 0.1), parameters={"r": 1.0, "c": 1.0}, by_entry=True), count=4096)
+    assert [one.values["first"] for one in draws] == [one.values["first"] for one in plain]
+
+
+def test_given_scores_are_those_before_the_correlation():
+    """Of a singular one too: two entries are the same, the third is their opposite."""
+    matrix = ((1.0, 1.0, -1.0), (1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+    same = Variation("v", Normal(0.0, 0.1), parameters={"r": 1.0}, by_entry=True, correlation=matrix)
+    use = RangeOfUse(PLANT, (same,))
+    e = np.array([0.3, -1.0, 0.5])
+    (one,) = use.draw(1, 2, scores=e)
+    # The symmetric root of a matrix w w' with |w|^2 = 3 is w w' / sqrt(3).
+    w = np.array([1.0, 1.0, -1.0])
+    np.testing.assert_allclose(one.values["v"], 0.1 * w * (w @ e) / np.sqrt(3), rtol=1e-6)
+    values = np.array([one.values["v"] for one in use.draw(64, 2)])
+    np.testing.assert_allclose(values, values[:, :1] * w, atol=1e-9)
+    np.testing.assert_allclose(use.nominal_scores, 0.0, atol=1e-9)
+
+
+def test_what_changes_nothing_has_the_score_of_it_also_where_entries_are_correlated():
+    use = RangeOfUse(PLANT, (Variation("v", Uniform(-0.1, 0.3), parameters={"r": 1.0}, by_entry=True, correlation=0.6),))
+    (one,) = use.draw(1, 2, scores=use.nominal_scores)
+    np.testing.assert_allclose(one.values["v"], 0.0, atol=1e-9)
+
+
+def test_draws_of_your_own():
+    """Rows of a table, each as likely; more draws begin with the same ones."""
+    table = [SimulatedPlant(MODEL.with_parameters(c=c), {"a": c}, PLANT.sensors) for c in (1.0, 2.0, 3.0)]
+    use = OwnDraws(PLANT, lambda rng: table[rng.integers(3)])
+    few, many, other = use.draw(5, 3), use.draw(300, 3), use.draw(300, 4)
+    starts = [one.plant.start["a"] for one in many]
+    assert [one.plant.start["a"] for one in few] == starts[:5]
+    assert [one.seed for one in few] == [one.seed for one in many[:5]]
+    assert len({one.seed for one in many}) == 300
+    assert all(70 < starts.count(c) < 130 for c in (1.0, 2.0, 3.0))
+    assert starts != [one.plant.start["a"] for one in other]
+    assert [one.plant.start["a"] for one in use.draw(5, 3, 7)] == starts[7:12]
+    assert {one.seed for one in many} == {one.seed for one in RangeOfUse(PLANT, ()).draw(300, 3)}

@@ -31,7 +31,7 @@ def drawn(settings, cell=CELL, count=64, **entries):
 def test_every_entry_has_a_bound_and_a_meaning():
     # What says nothing of the plants.
     own = ("draws", "drop_idle", "cell")
-    assert {*MOST, *PAIRS, *own} == {part.name for part in fields(ChargingRangeSettings)} == {*MEANING, *own}
+    assert {*MOST, *PAIRS, "cells", "node_correlation", *own} == {part.name for part in fields(ChargingRangeSettings)} == {*MEANING, *own}
 
 
 @pytest.mark.parametrize(("name", "most"), MOST.items())

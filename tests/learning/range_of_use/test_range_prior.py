@@ -28,6 +28,13 @@ VARIATIONS = (
     ct.Variation("sensor", ct.Normal(0.0, 0.1), biases={"T": 1.0}),
     ct.Variation("kind", ct.Choice((-0.1, 0.1)), parameters={"gain": 1.0}),
 )
+# What has correlated entries, in the exponent.
+MIXED = (
+    ct.Variation("make", ct.StudentT(5.0), parameters={"rate": (0.1, 0.2), "gain": 0.3}, by_entry=True, log=True,
+                 correlation=((1.0, 0.9, 0.0), (0.9, 1.0, 0.3), (0.0, 0.3, 1.0))),
+    ct.Variation("node", ct.Uniform(-0.1, 0.2), parameters={"rate": 1.0}, by_entry=True, correlation=0.7),
+    ct.Variation("weather", ct.Uniform(-1.0, 1.0), parameters={"around": 0.5}, starts={"T": 1.0}, of="episode"),
+)  # fmt: skip
 SPACE = ct.ParameterSpace((ct.Parameter("power", 0.05, 2.0, default=1.0),))
 BLIND = ct.Controller.build(
     MODEL, SPACE, horizon=1, stage_cost=lambda s: (s.u["u"] - s.theta["power"]) ** 2, input_lower={"u": 0.0}, input_upper={"u": 2.0}
@@ -70,6 +77,19 @@ def test_slopes_are_those_of_finite_differences():
     prior = RangePrior(oven())
     e, step = np.array([0.3, -0.8, 1.2, 0.4, 0.9]), 1e-5
     expected = np.array([(prior.at(e + d) - prior.at(e - d)) / (2 * step) for d in step * np.eye(5)]).T
+    np.testing.assert_allclose(prior.slopes(e), expected, rtol=1e-4, atol=1e-8)
+
+
+def test_correlated_entries_follow_from_the_same_scores_as_the_draws():
+    use = oven(*MIXED)
+    prior = RangePrior(use)
+    scores = np.random.default_rng(1).standard_normal((8, prior.size))
+    for one, m in zip(use.draw(8, 3, scores=scores), prior.at(scores), strict=True):
+        blocks = dict(one.plant.model.parameters)
+        np.testing.assert_allclose(0.2 * np.exp(m[:2]), blocks["rate"], rtol=1e-9)
+        np.testing.assert_allclose(np.exp(m[2]), blocks["gain"], rtol=1e-9)
+    e, step = scores[0], 1e-5
+    expected = np.array([(prior.at(e + d) - prior.at(e - d)) / (2 * step) for d in step * np.eye(prior.size)]).T
     np.testing.assert_allclose(prior.slopes(e), expected, rtol=1e-4, atol=1e-8)
 
 

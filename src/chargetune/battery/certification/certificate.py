@@ -145,7 +145,7 @@ def write_certificate(
     ordered = sorted(charges, key=lambda charge: charge.index)
     archive = io.BytesIO()
     np.savez_compressed(archive, allow_pickle=False, **_arrays(ordered))
-    digest = hashlib.sha256(archive.getvalue()).hexdigest()
+    digest, entries = hashlib.sha256(archive.getvalue()).hexdigest(), problem.range.entries if problem.range else {}
     traces = write_whole(path.with_name(f"{path.stem}-{digest[:12]}.npz"), archive.getvalue())
     certificate: dict[str, Any] = {
         "format": FORMAT,
@@ -161,8 +161,8 @@ def write_certificate(
         "soc_target": problem.episode.soc_target,
         "seed": seed,
         "confidence": confidence,
-        "range": {} if problem.range is None else problem.range.entries,
-        "meaning": MEANING,
+        "range": entries,
+        "meaning": {name: MEANING[name] for name in entries},
         "drawn": drawn_text(problem),
         "judged": "true outputs, without sensor noise, at both ends of every interval",
         "limits": [
@@ -189,6 +189,14 @@ def drawn_text(problem: ChargingProblem) -> str:
     parts = [DRAWN.replace("told none of them: it reads", f"told only {told}, which choose its theta: else it reads") if told else DRAWN]
     if not problem.plant_cell:
         parts.append(DRAWN_ELECTROCHEMICAL)
+    if problem.range is not None and problem.range.node_correlation:
+        parts.append("Only those of the nodes of one table are correlated.")
+    if problem.range_cells:
+        names = ", ".join(one.name for one in problem.range_cells)
+        parts.append(
+            f"Before that, R, C and capacity are drawn as another cell of the make of {len(problem.range_cells)} cells: {names}; "
+            "predictive distribution of their logarithms, Student's t."
+        )
     cell = problem.range.cell if problem.range else None
     if cell is not None:
         parts.append(f"The plant is one cell of the range, number {cell}: what is of a cell is the same in each episode.")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
 from chargetune.battery.charging.controller import controller_of
+from chargetune.battery.charging.population import population
 from chargetune.battery.charging.problem import ChargingProblem, judged_exactly
 from chargetune.battery.charging.range_settings import NOT_ELECTROCHEMICAL, ChargingRangeSettings
 from chargetune.battery.charging.verdict import NotMeasuredError, charge_samples, score_episode
@@ -39,10 +40,19 @@ def range_of_use(problem: ChargingProblem, settings: ChargingRangeSettings) -> R
 
     The start of each charge is at rest, and where the cell has a temperature in equilibrium with its ambient.
     """
-    cell = problem.plant_cell or problem.cell
+    cell, out = problem.plant_cell or problem.cell, []
+    if settings.cells:
+        cell, differ = population(cell, problem.range_cells)
+        out.append(differ)
     resistances, capacitances = ([n for n in cell.tables if n.startswith(letter)] for letter in "RC")
-    out = [
-        Variation(name, Uniform(-width, width), parameters=dict.fromkeys(tables, 1.0), by_entry=name.endswith("node"))
+    out += [
+        Variation(
+            name,
+            Uniform(-width, width),
+            parameters=dict.fromkeys(tables, 1.0),
+            by_entry=name.endswith("node"),
+            correlation=settings.node_correlation if name.endswith("node") else 0.0,
+        )
         for name, width, tables in (
             ("resistance", settings.resistance, resistances),
             ("resistance_by_node", settings.resistance_by_node, resistances),
@@ -107,6 +117,8 @@ class ChargingRange:
                 raise ValueError(
                     f"range: {name} = {getattr(settings, name):g}, allowed is 0 for an electrochemical plant: it has no circuit"
                 )
+        if settings.cells:
+            raise ValueError(f"range: cells = {settings.cells!r}, allowed is none for an electrochemical plant: it has no circuit")
         # Refused before the first charge is an ambient that the plant may not have.
         for ambient in settings.ambient_K or ():
             replace(known, ambient_K=ambient)

@@ -14,6 +14,7 @@ from chargetune.battery.cell.cell import Cell, mismatched
 from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import Limit, LimitSettings
 from chargetune.battery.charging.observers import settings_of
+from chargetune.battery.charging.population import check_population
 from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import (
     ControllerSettings,
@@ -62,6 +63,8 @@ class ChargingProblem:
     theta: Tunables = field(default_factory=Tunables)
     safety: SafetySettings | None = None
     range: ChargingRangeSettings | None = None
+    range_cells: tuple[Cell, ...] = ()
+    """The cells of the files in the folder ``range.cells``."""
 
     def __post_init__(self) -> None:
         try:
@@ -191,6 +194,8 @@ class ChargingProblem:
     def _check_range(self) -> None:
         if self.range is None:
             return
+        if self.range.cells:
+            check_population(self.plant_cell or self.cell, self.range_cells, self.range.cells)
         if self.range.ambient_K is not None and (self.plant_cell or self.cell).thermal is None:
             raise ValueError(f"range: ambient_K = {list(self.range.ambient_K)}, allowed only for a cell with a [thermal] table")
         if self.theta.schedule is not None:

@@ -20,7 +20,7 @@ from chargetune.episode.episode import Episode
 from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.score import Score
 from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
-from chargetune.plants.variation import Variation
+from chargetune.plants.variation import Normal, Variation
 
 if TYPE_CHECKING:
     from chargetune.episode.compiled import CompiledEpisode
@@ -64,7 +64,9 @@ class ChargingRangeTwin:
         if not self.spread:
             return known
         tables = dict.fromkeys(self.use.problem.cell.tables, 1.0)
-        return replace(known, variations=(*known.variations, Variation("model", _Factor(self.spread), parameters=tables, by_entry=True)))
+        return replace(
+            known, variations=(*known.variations, Variation("model", Normal(0.0, self.spread), parameters=tables, by_entry=True, log=True))
+        )
 
     @cached_property
     def twin(self) -> Twin:
@@ -136,18 +138,6 @@ class ChargingRangeTwin:
 
         use = self.use
         return compiled_episode(controller_of(use.problem), use.range_of_use.plant, use.problem.episode.steps, lookup_table=table)
-
-
-@dataclass(frozen=True)
-class _Factor:
-    """v of a factor 1 + v whose logarithm is normal with mean 0."""
-
-    log_sd: float
-
-    def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
-        from scipy.special import ndtri
-
-        return np.asarray(np.expm1(self.log_sd * ndtri(share)), dtype=np.float64)
 
 
 @dataclass(frozen=True)

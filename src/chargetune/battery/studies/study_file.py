@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from chargetune.battery.charging.kalman import Kalman
 from chargetune.battery.charging.limits import LimitSettings
 from chargetune.battery.charging.observers import Adaptive, OffsetFree
 from chargetune.battery.charging.problem import ChargingProblem
-from chargetune.battery.charging.range_settings import ChargingRangeSettings
+from chargetune.battery.charging.range_settings import ADDED, ChargingRangeSettings
 from chargetune.battery.charging.settings import (
     FILTERS,
     ControllerSettings,
@@ -162,8 +162,10 @@ class Config(_Table):
     """What differs between the cells and charges that the controller will meet."""
     _file: str = PrivateAttr(default="")
 
-    def problem(self, folder: Path | None = None, *, cell: Cell | None = None, plant: Plant | None = None) -> ChargingProblem:
-        """The charging problem; a relative file is looked for in ``folder``, ``cell`` and ``plant`` stand in for the files'.
+    def problem(
+        self, folder: Path | None = None, *, cell: Cell | None = None, plant: Plant | None = None, range_cells: Sequence[Cell] | None = None
+    ) -> ChargingProblem:
+        """The charging problem; a relative file is looked for in ``folder``, and what else is given stands in for the files'.
 
         Raises ValueError, FileNotFoundError.
         """
@@ -180,6 +182,7 @@ class Config(_Table):
                 theta=self.theta,
                 safety=self.safety,
                 range=self.range,
+                range_cells=self._range_cells(folder) if range_cells is None else tuple(range_cells),
             )
 
     @contextmanager
@@ -223,8 +226,7 @@ class Config(_Table):
         for name in ("safety", "twin", "range"):
             if data[name] is None:
                 del data[name]
-        if self.range is not None and self.range.cell is None:
-            del data["range"]["cell"]
+        data |= self._range_document(folder)
         settings = self.estimator.settings
         if isinstance(settings, (OffsetFree, Adaptive)):
             # Defaults may change; what decides the trials does not.
@@ -240,8 +242,6 @@ class Config(_Table):
         for table, name in (*absent, *(("estimator", name) for name in FILTERS)):
             if not data[table][name]:
                 del data[table][name]
-        if data.get("range") and not data["range"]["drop_idle"]:
-            del data["range"]["drop_idle"]
         for part in ("backoff", "temperature_backoff", "anode_backoff"):
             if data["theta"][part] and not data["theta"][part]["over"]:
                 del data["theta"][part]["over"]
@@ -251,6 +251,30 @@ class Config(_Table):
         table = self.cell
         cell = default_cell() if table.file is None else load_cell(_beside(folder, table.file))
         return replace(cell, series=table.series or cell.series, parallel=table.parallel or cell.parallel)
+
+    def _range_document(self, folder: Path | None) -> dict[str, Any]:
+        """The table [range] without what is not given, and the cells of the folder that it names."""
+        if self.range is None:
+            return {}
+        table: dict[str, Any] = json.loads(json.dumps(asdict(self.range)))
+        for name in ("cell", "drop_idle", *ADDED):
+            if table[name] == getattr(ChargingRangeSettings(), name):
+                del table[name]
+        if not self.range.cells:
+            return {"range": table}
+        # Where the folder lies decides nothing, what is in it does.
+        return {
+            "range": table | {"cells": Path(self.range.cells).name},
+            "range_cells": [_cell_document(one) for one in self._range_cells(folder)],
+        }
+
+    def _range_cells(self, folder: Path | None) -> tuple[Cell, ...]:
+        if self.range is None or not self.range.cells:
+            return ()
+        place = _beside(folder, self.range.cells)
+        if not place.is_dir():
+            raise ValueError(f"range.cells = {str(place)!r}, allowed is a folder of cell files")
+        return tuple(load_cell(path) for path in sorted(place.glob("*.toml")))
 
     def _plant(self, folder: Path | None) -> Plant | None:
         plant = self.plant
@@ -334,7 +358,7 @@ def _check_replaced(data: Mapping[str, Any]) -> None:
 
 def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     """The problem of a stored study, from what `Config.document` recorded."""
-    tables = {name: table for name, table in document.items() if name not in ("cell", "study")}
+    tables = {name: table for name, table in document.items() if name not in ("cell", "study", "range_cells")}
     plant = tables.get("plant")
     made: Plant | None = None
     if isinstance(plant, Mapping) and "cell" in plant:
@@ -344,7 +368,8 @@ def problem_of_document(document: Mapping[str, Any]) -> ChargingProblem:
     config = Config.model_validate_json(json.dumps(_migrated(tables)))
     # A store of before the content was kept has the path, which is read when the plant is built.
     by_path = config.plant if isinstance(config.plant, Electrochemical) else None
-    return config.problem(cell=_cell_of_document(document["cell"]), plant=made or by_path)
+    cells = [_cell_of_document(one) for one in document.get("range_cells", ())]
+    return config.problem(cell=_cell_of_document(document["cell"]), plant=made or by_path, range_cells=cells)
 
 
 def _cell_of_document(data: Mapping[str, Any]) -> Cell:

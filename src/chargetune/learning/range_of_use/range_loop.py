@@ -16,7 +16,7 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.episode.score_limits import ScoredLimit, limit_samples, score_limits
 from chargetune.model.given import Given, checked_given
-from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
+from chargetune.plants.range_of_use import DrawnPlant, OwnDraws, RangeOfUse
 
 __all__ = ["RangeLoop", "SimulatedRange"]
 
@@ -48,7 +48,7 @@ class RangeLoop(Protocol):
 
 @dataclass(frozen=True)
 class SimulatedRange:
-    """The `RangeLoop` of a controller and a simulated plant whose numbers differ (`Variation`).
+    """The `RangeLoop` of a controller and a simulated plant whose numbers differ (`Variation`), or draws of yours (`OwnDraws`).
 
     The estimator reads what the drawn sensors measure; the limits are judged by the true outputs, `ScoredLimit` by `ScoredLimit`.
     ``given``: the given signals of controller and plant, one set for all draws or several cases (days, forecasts), of which each draw
@@ -56,7 +56,7 @@ class SimulatedRange:
     """
 
     controller: Controller
-    range_of_use: RangeOfUse
+    range_of_use: RangeOfUse | OwnDraws
     steps: int
     limits: tuple[ScoredLimit, ...]
     objective: Callable[[Episode], float]

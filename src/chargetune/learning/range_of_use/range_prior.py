@@ -29,9 +29,10 @@ class RangePrior:
 
         m_p = sum_j ln(1 + s_j v_j)  for a parameter p,   m_x = sum_j s_j v_j  for a start or a bias,
 
-    over the variations j that change it. What is of the episode is read off each trace: of a variation with a start, v follows from
-    the state there, and so do the parameters that it changes too, such as an ambient temperature. The state is the first measured value
-    where the estimator reads it (``read``), else the estimate. A number without slope, such as a `Choice`, stays what it was before.
+    over the variations j that change it; of those with ``log`` the summand is s_j v_j, and correlated numbers have the scores L e.
+    What is of the episode is read off each trace: of a variation with a start, v follows from the state there, and so do the parameters
+    that it changes too, such as an ambient temperature. The state is the first measured value where the estimator reads it (``read``),
+    else the estimate. A number without slope, such as a `Choice`, stays what it was before.
     """
 
     range_of_use: RangeOfUse
@@ -62,10 +63,13 @@ class RangePrior:
 
     def at(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unknowns m of scores e (..., size)."""
-        return np.asarray(self._unknowns(self._values(scores)))
+        mixing = self.range_of_use.plant_mixing
+        return np.asarray(self._unknowns(self._values(scores if mixing is None else scores @ mixing.T)))
 
     def slopes(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """dm/de at scores e (size,), shape (unknowns, size)."""
+        mixing = self.range_of_use.plant_mixing
+        scores = scores if mixing is None else mixing @ scores
         values = self._values(scores)
         up, down = self._values(scores + STEP) - values, values - self._values(scores - STEP)
         # The lesser of both sides: at a jump there is no slope.
@@ -78,7 +82,8 @@ class RangePrior:
             moved[1, j] -= STEP * steep[j]
             high, low = self._unknowns(moved)
             columns.append((high - low) / (2 * STEP))
-        return np.array(columns).T.reshape(-1, self.size)
+        slopes = np.array(columns).T.reshape(-1, self.size)
+        return slopes if mixing is None else slopes @ mixing
 
     def under(self, twin: Twin, episode: Episode) -> Twin:
         """The twin in the condition of this episode: where it began, and what goes with that."""
@@ -91,8 +96,8 @@ class RangePrior:
             # What a trace does not show is taken as in the middle of its range.
             middle = float(one.distribution.at(np.array([0.5]))[0])
             v = (seen[states[0]] - twin.start.get(states[0], 0.0)) / one.starts[states[0]] if states else middle
-            for name, sensitivity in one.parameters.items():
-                parameters[name] = parameters[name] * (1.0 + sensitivity * v)
+            for name in one.parameters:
+                parameters[name] = parameters[name] * one.factor(name, v)
             if not states:
                 for name, sensitivity in one.starts.items():
                     start[name] = start.get(name, 0.0) + sensitivity * v
@@ -127,7 +132,7 @@ class RangePrior:
         return self.range_of_use.plant.model.parameter_blocks[name] if kind == "factor" else 1
 
     def _values(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Numbers v of scores e, the same shape."""
+        """Numbers v of the scores of each alone, the same shape."""
         from scipy.special import ndtr
 
         shares = np.clip(ndtr(scores), LEAST_SHARE, 1.0 - LEAST_SHARE)
@@ -142,10 +147,10 @@ class RangePrior:
         parts = np.split(values, np.cumsum([size for _, size in self._plants])[:-1], axis=-1)
         for (one, _), part in zip(self._plants, parts, strict=True):
             first = 0
-            for name, sensitivity in one.parameters.items():
+            for name in one.parameters:
                 own = part[..., first : first + blocks[name]] if one.by_entry else part
                 first += blocks[name] if one.by_entry else 0
-                logs[name] = logs[name] + np.log1p(sensitivity * own)
+                logs[name] = logs[name] + one.log_factor(name, own)
             for label in ("starts", "biases"):
                 for name, sensitivity in getattr(one, label).items():
                     added[label][name] = added[label][name] + sensitivity * part[..., :1]

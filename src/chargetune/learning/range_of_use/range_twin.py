@@ -22,7 +22,7 @@ from chargetune.learning.twin.rollout import parameters
 from chargetune.learning.twin.simulated_twin import default_features, default_floor
 from chargetune.learning.twin.twin import Twin
 from chargetune.learning.twin.twin_loop import ModelledLoop
-from chargetune.plants.range_of_use import DrawnPlant
+from chargetune.plants.range_of_use import DrawnPlant, RangeOfUse
 
 __all__ = ["Matched", "RangeTwinLoop", "SimulatedRangeTwin", "parameters_of", "run_drawn"]
 
@@ -116,6 +116,8 @@ class SimulatedRangeTwin:
     @cached_property
     def twin(self) -> Twin:
         use, limits = self.range.range_of_use, self.range.limits
+        if not isinstance(use, RangeOfUse):
+            raise ValueError("range twin: range_of_use = OwnDraws, allowed is a RangeOfUse, which says what is of the plant")
         sensors = use.plant.sensors.noise_sd
         noise = {name: sd for name, sd in sensors.items() if sd > 0} if self.noise_sd is None else dict(self.noise_sd)
         floor = default_floor(noise, limits, self.features_in) | dict(self.discrepancy_sd_floor or {})
