@@ -104,6 +104,19 @@ def test_a_violation_that_does_not_change_with_theta_is_left_behind():
     assert 0.85 * best < theta[0] < 1.001 * best
 
 
+@pytest.mark.parametrize("corners", [0, 8])
+def test_beside_a_plant_that_no_theta_mends_all_others_keep_the_limit(corners):
+    """A plant that begins half beyond the limit stays there whatever theta is; the best power is that of the others."""
+    rare = ct.Variation("hot", ct.Choice((0.0,) * 31 + (1.5,)), starts={"T": 1.0}, of="episode")
+    use = ct.RangeOfUse(ct.SimulatedPlant(heater(1.0), {}), (*RANGE.variations, rare))
+    evaluation = ct.RangeEvaluation(loop(range_of_use=use), 40)
+    tuner = ct.RangeTuner(evaluation, seed=0, settings=ct.RangeSettings(corners=corners))
+    drawn = use.draw(tuner.settings.plants, 0)
+    assert 0 < sum(one.values["hot"][0] > 0 for one in drawn) < 6
+    best = LIMIT / (1.25 * (1 - 0.8**STEPS))
+    assert tuner.ask(SPACE, [])[0][0] == pytest.approx(best, rel=0.01)
+
+
 def test_a_trial_is_judged_on_draws_that_nothing_was_chosen_on():
     evaluation = ct.RangeEvaluation(loop(), 40)
     tuner = ct.RangeTuner(evaluation, seed=0)

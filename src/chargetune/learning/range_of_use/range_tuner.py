@@ -105,7 +105,8 @@ class RangeTuner:
         # From both: near the last theta there is mostly the best one, but not where a violation of it has no slope.
         starts = (last, self._start(space, search, last)) if self.settings.pool else (last,)
         found = [search.refine(start) for start in {u.tobytes(): u for u in starts}.values()]
-        search, u = self._at_corners(search, min(found, key=search.merit_of_all))
+        search, u = self._mended(search, min(found, key=search.merit_of_all))
+        search, u = self._at_corners(search, u)
         theta = space.from_unit(u)
         if self.settings.drop_idle:
             theta = without_idle(self.evaluation, space, theta, search.plants)
@@ -116,14 +117,27 @@ class RangeTuner:
         loop, settings = self.evaluation.loop, self.settings
         corners = list(loop.draw(settings.corners, self.seed, extreme=settings.extreme)) if settings.corners else []
         for _ in range(CORNER_ROUNDS):
-            violations = [search.violation(u, one) for one in corners]
+            violations = search.violations(u, corners)
             worst = [k for k in np.argsort(violations)[::-1][: settings.added] if violations[k] > 0]
             if not worst:
                 break
             search = search.with_rows_of([corners[k] for k in worst])
             corners = [one for k, one in enumerate(corners) if k not in worst]
-            u = search.refine(u)
+            search, u = self._mended(search, search.refine(u))
         return search, u
+
+    def _mended(self, search: _RangeSearch, u: NDArray[np.float64]) -> tuple[_RangeSearch, NDArray[np.float64]]:
+        """Where a search ended beyond a tolerance: the same from the best of a few points on all plants.
+
+        Where the input is saturated a violation has no slope, and beside one that is not mended all others are let grow as large. What a
+        plant has left at its best point of these is left behind.
+        """
+        if search.violation_of_all(u) <= 1.0 - self.settings.aim:
+            return search, u
+        points = [u, np.zeros(u.size), np.ones(u.size), *sobol_points(u.size, self.seed, 0, self.settings.pool)]
+        search = search.leaving_behind(points)
+        begin = min(points, key=search.merit_of_all)
+        return search, min(u, search.refine(begin), key=search.merit_of_all)
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""
@@ -144,7 +158,7 @@ class RangeTuner:
 class _RangeSearch:
     """Points of the unit cube on several plants: the objective is that of ``common`` ones, rows are those of ``added`` ones too.
 
-    ``margin`` in tolerances.
+    ``margin`` in tolerances; ``left`` is the violation of each of all plants that is left behind, in tolerances; None: of none.
     """
 
     def __init__(
@@ -155,9 +169,11 @@ class _RangeSearch:
         added: Sequence[DrawnPlant],
         margin: float,
         settings: RangeSettings,
+        left: Sequence[float] | None = None,
     ) -> None:
         self._evaluation, self._space, self._settings = evaluation, space, settings
         self.plants, self._added, self._margin = [*added, *common], len(added), margin
+        self._left = [0.0] * len(self.plants) if left is None else list(left)
 
     def refine(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         settings = self._settings
@@ -166,38 +182,62 @@ class _RangeSearch:
 
     def merit(self, u: NDArray[np.float64]) -> float:
         """The objective on a few plants, to be minimised, and the worst violation with a penalty."""
-        return _merit(self._point(u, self.plants[: self._settings.first]))
+        return _merit(self._point(u, self._settings.first))
 
     def merit_of_all(self, u: NDArray[np.float64]) -> float:
         """The same on all plants."""
-        return _merit(self._point(u, self.plants))
+        return _merit(self._point(u))
 
-    def violation(self, u: NDArray[np.float64], plant: DrawnPlant) -> float:
-        """That of the rows of one plant; inf where it has no verdict."""
-        point = self._point(u, [plant])
+    def violation_of_all(self, u: NDArray[np.float64]) -> float:
+        """The largest of all plants; inf where one has no verdict."""
+        point = self._point(u)
         return np.inf if point is None else point.violation
+
+    def violations(self, u: NDArray[np.float64], plants: Sequence[DrawnPlant], left: Sequence[float] | None = None) -> NDArray[np.float64]:
+        """That of each of these plants; inf where it has no verdict."""
+        found = self._of_each(u, plants, [0.0] * len(plants) if left is None else left)
+        return np.array([np.inf if one is None else float(np.max(one[0], initial=0.0)) for one in found])
 
     def with_rows_of(self, plants: Sequence[DrawnPlant]) -> _RangeSearch:
         """The same search with the rows of these plants too."""
-        added, common = self.plants[: self._added], self.plants[self._added :]
-        return _RangeSearch(self._evaluation, self._space, common, [*plants, *added], self._margin, self._settings)
+        return self._with([*plants, *self.plants[: self._added]], [*[0.0] * len(plants), *self._left])
+
+    def leaving_behind(self, points: Sequence[NDArray[np.float64]]) -> _RangeSearch:
+        """The same search without what each plant violates at the best of these points too."""
+        least = np.min([self.violations(u, self.plants, self._left) for u in points], axis=0)
+        return self._with(self.plants[: self._added], self._left + np.where(np.isfinite(least), least, 0.0))
+
+    def _with(self, added: Sequence[DrawnPlant], left: Sequence[float] | NDArray[np.float64]) -> _RangeSearch:
+        common = self.plants[self._added :]
+        return _RangeSearch(self._evaluation, self._space, common, added, self._margin, self._settings, [float(v) for v in left])
 
     def _points(self, us: Sequence[NDArray[np.float64]]) -> list[Point | None]:
-        return [self._point(u, self.plants) for u in us]
+        return [self._point(u) for u in us]
 
-    def _point(self, u: NDArray[np.float64], plants: Sequence[DrawnPlant]) -> Point | None:
-        theta = self._space.from_unit(np.clip(u, 0.0, 1.0))
-        rows, worth = [], []
-        for episode in self._evaluation.loop.simulate([theta] * len(plants), plants):
-            score: Score | None = None if episode is None else self._evaluation.loop.score(episode, metrics=False)
-            if episode is None or score is None:
-                return None
-            excess, _ = samples_of(score, self._evaluation.loop.samples(episode), self._settings.aim)
-            rows.append(excess + self._margin)
-            worth.append(score.objective)
+    def _point(self, u: NDArray[np.float64], first: int | None = None) -> Point | None:
+        """Of all plants, or the first so many."""
+        found = self._of_each(u, self.plants[:first], self._left[:first])
+        if None in found:
+            return None
+        known = [one for one in found if one is not None]
         # The worst plants of trials are no fair sample of what a theta is worth.
-        common = worth[self._added :] if len(plants) == len(self.plants) else worth
-        return Point(-objective_over(self._evaluation.aim, common), np.concatenate(rows))
+        common = [worth for _, worth in (known[self._added :] if first is None else known)]
+        return Point(-objective_over(self._evaluation.aim, common), np.concatenate([rows for rows, _ in known]))
+
+    def _of_each(
+        self, u: NDArray[np.float64], plants: Sequence[DrawnPlant], left: Sequence[float]
+    ) -> list[tuple[NDArray[np.float64], float] | None]:
+        """Rows and objective of each plant; None where it has no verdict."""
+        theta, loop = self._space.from_unit(np.clip(u, 0.0, 1.0)), self._evaluation.loop
+        found: list[tuple[NDArray[np.float64], float] | None] = []
+        for episode, behind in zip(loop.simulate([theta] * len(plants), plants), left, strict=True):
+            score: Score | None = None if episode is None else loop.score(episode, metrics=False)
+            if episode is None or score is None:
+                found.append(None)
+                continue
+            excess, _ = samples_of(score, loop.samples(episode), self._settings.aim)
+            found.append((excess + (self._margin - behind), score.objective))
+        return found
 
 
 def _merit(point: Point | None) -> float:
