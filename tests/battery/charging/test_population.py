@@ -136,7 +136,7 @@ def test_the_store_holds_the_cells_and_needs_no_folder(folder):
         path.unlink()
     again = problem_of_document(document)
     assert again.range_cells == problem.range_cells
-    assert again.range.line == "soc_start 0.3 to 0.5, cells of cells"
+    assert again.range.line == "soc_start 0.3 to 0.5, cells like those of cells"
     first, second = (ChargingRange(one).draw(3, 1) for one in (problem, again))
     assert [one.values for one in first] == [one.values for one in second]
 

@@ -137,7 +137,7 @@ def range_line(entries: Mapping[str, float | str | Sequence[float] | None]) -> s
         if isinstance(value, (int, float)) and value:
             shown.append(f"{name} {'' if name in ('fade', 'growth', 'node_correlation') else '+-'}{value:g}")
         elif isinstance(value, str):
-            shown.append(f"{name} of {value}")
+            shown.append(f"{name} like those of {value}")
         elif isinstance(value, Sequence):
             shown.append(f"{name} {value[0]:g} to {value[1]:g}")
     return ", ".join(shown) or "nothing differs but the noise"
