@@ -33,6 +33,10 @@ def folder(tmp_path, studied):
     (tmp_path / "charge.sqlite").write_bytes(studied)
     (tmp_path / "cell.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
     (tmp_path / "study.toml").write_text(study_text(study={"trials": 1}, cell={"file": "cell.toml"}))
+    (tmp_path / "cells").mkdir()
+    for i in range(3):
+        (tmp_path / "cells" / f"{i}.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
+    (tmp_path / "make.toml").write_text(study_text(study={"trials": 1}, cell={"file": "cell.toml"}, range={"cells": "cells"}))
     (tmp_path / "pulses.csv").write_bytes(PULSES.read_bytes())
     (tmp_path / "many.toml").write_text('[campaign]\nconfigs = ["study.toml"]\nseeds = [0]\n')
     (tmp_path / "slow.csv").write_bytes(PULSES.read_bytes())
@@ -42,7 +46,11 @@ def folder(tmp_path, studied):
 
 
 def contents(folder):
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file() and not p.name.endswith(("-wal", "-shm", "-lock"))}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file() and not p.name.endswith(("-wal", "-shm", "-lock"))
+    }
 
 
 @pytest.mark.parametrize(
@@ -54,6 +62,7 @@ def contents(folder):
         ("report charge.sqlite --no-evaluate -o charge.sqlite-wal", "--output"),
         ("report charge.sqlite --no-evaluate -o study.toml --overwrite", "--output"),
         ("report charge.sqlite --no-evaluate -o absent/page.html", "--output"),
+        ("tune make.toml --store cells/0.toml", "--store"),
         ("report charge.sqlite --no-evaluate -o study.toml/page.html", "--output"),
         ("identify pulses.csv -o pulses.csv --overwrite", "--output"),
         ("identify pulses.csv -o cell.toml", "--output"),

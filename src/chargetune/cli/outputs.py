@@ -115,8 +115,9 @@ def _of_data(text: str) -> Kind:
 
 
 def read_by(path: Path, document: Mapping[str, Any] | None = None) -> list[Path]:
-    """A study or campaign file and the files that it names; ``document`` is its content, where it has been read."""
-    return [path, *(found for text in _texts(document) if (found := path.parent / text).is_file())]
+    """A study or campaign file, the files that it names and those of cells in folders that it names; ``document`` is its content."""
+    named = [path.parent / text for text in _texts(document)]
+    return [path, *(found for one in named for found in ([one] if one.is_file() else one.glob("*.toml")))]
 
 
 def _texts(value: Any) -> Iterator[str]:
