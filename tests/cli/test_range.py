@@ -132,7 +132,8 @@ def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):
     done = chargetune("compare", folder / "use.toml", "--store", folder / "use.sqlite", "--draws", 4, "--workers", 1, "--json")
     told = json.loads(done.stdout)
     rows = {row["name"]: row for row in told["rows"]}
-    wanted = ["CC-CV that keeps all limits", "nominal MPC", "nominal offset-free MPC", "best constant backoff"]
+    wanted = ["CC-CV that keeps all limits", "multi-step CC that keeps all limits", "nominal MPC", "nominal offset-free MPC"]
+    wanted.append("best constant backoff")
     assert list(rows) == [*wanted, "tuned", "MPC that knows each plant", "plant oracle"]
     assert rows["nominal offset-free MPC"]["worst_excess"]["voltage_max_V"] < rows["nominal MPC"]["worst_excess"]["voltage_max_V"]
     assert {row["draws"] for row in rows.values()} == {told["draws"]} == {4}

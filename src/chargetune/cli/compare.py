@@ -135,9 +135,9 @@ def _over_range(
     screen.print(table)
     line = "" if problem.range is None else problem.range.line
     screen.print(
-        f"Range of use: {line}. The same {counted(draws, 'drawn plant')} in every row, judged by their true outputs. CC-CV has the "
-        "fastest rate, and the constant backoffs the smallest values, with which all of these plants keep every limit, or the most "
-        "cautious one if none does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
+        f"Range of use: {line}. The same {counted(draws, 'drawn plant')} in every row, judged by their true outputs. CC-CV and steps "
+        "have the fastest rate, and the constant backoffs the smallest values, with which all of these plants keep every limit, or the "
+        "most cautious one if none does; they were chosen on them, tuned theta was not. The plant oracle knows each plant.",
         style="dim",
     )
     if result is not None:

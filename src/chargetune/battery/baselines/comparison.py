@@ -20,9 +20,19 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 
 __all__ = [
-    "CCCV", "FEEDBACK", "ConstantBackoffs", "Row", "Verdict", "chosen_rows", "compare", "largest_share", "plant_oracle", "row_names",
+    "CCCV",
+    "FEEDBACK",
+    "STEP_SHARES",
+    "ConstantBackoffs",
+    "Row",
+    "Verdict",
+    "chosen_rows",
+    "compare",
+    "largest_share",
+    "plant_oracle",
+    "row_names",
     "smallest_that_keep",
-]  # fmt: skip
+]
 
 # CC-CV at the fastest rate with which every limit is kept.
 CCCV = "CC-CV that keeps all limits"

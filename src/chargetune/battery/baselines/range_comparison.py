@@ -10,10 +10,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from chargetune.battery.baselines.charging_protocols import charge, constant_current
+from chargetune.battery.baselines.charging_protocols import CurrentLaw, charge, constant_current, multi_step
 from chargetune.battery.baselines.comparison import (
     CCCV,
     FEEDBACK,
+    STEP_SHARES,
     ConstantBackoffs,
     chosen_rows,
     largest_share,
@@ -30,11 +31,12 @@ from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.plants.range_of_use import DrawnPlant
 
-__all__ = ["DRAWS", "ORACLE", "RangeRow", "compare_range", "range_row_names"]
+__all__ = ["DRAWS", "ORACLE", "STEPS", "RangeRow", "compare_range", "range_row_names"]
 
 # Plants that are charged in every way: means of a time over so many are sure to a per cent, and the oracle takes seconds for each.
 DRAWS = 40
 ORACLE = "plant oracle"
+STEPS = "multi-step CC that keeps all limits"
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class RangeRow:
 def range_row_names(problem: ChargingProblem, theta: Sequence[float] | None) -> list[str]:
     """What can be compared over the range, in the order of the table."""
     feedback = [] if problem.estimator.follows_offset else [FEEDBACK]
-    names = [CCCV, "nominal MPC", *feedback, "best constant backoff", *(["tuned"] if theta is not None else [])]
+    names = [CCCV, STEPS, "nominal MPC", *feedback, "best constant backoff", *(["tuned"] if theta is not None else [])]
     return [*names, *(["MPC that knows each plant"] if problem.plant_cell else []), ORACLE]
 
 
@@ -90,9 +92,10 @@ def compare_range(
 ) -> Iterator[RangeRow]:
     """Run every row of `range_row_names`, or the named ones, on the same plants of the range of use, in the order in which they are done.
 
-    CC-CV has the fastest rate, and the constant backoffs the smallest values, with which every limit is kept on all of the plants; where
-    none does, the most cautious one. CC-CV keeps the voltage exactly, the oracle every limit: it knows each plant. Controllers see the
-    problem's sensors with noise; all are judged by the true outputs. Raises ValueError without a range, or for an unknown row.
+    CC-CV and the steps, currents in the proportions `STEP_SHARES` in five equal SOC windows, have the fastest rate, and the constant
+    backoffs the smallest values, with which every limit is kept on all of the plants; where none does, the most cautious one. CC-CV and
+    the steps keep the voltage exactly, the oracle every limit: it knows each plant. Controllers see the problem's sensors with noise; all
+    are judged by the true outputs. Raises ValueError without a range, or for an unknown row.
     """
     names = chosen_rows(range_row_names(problem, theta), rows)
     drawn = _Drawn(problem, draws, seed)
@@ -125,9 +128,11 @@ class _Drawn:
 
     def row(self, name: str, theta: Sequence[float] | None) -> RangeRow:
         problem = self.problem
-        plain = replace(problem, theta=Tunables())
+        every = list(problem.limits_by_name.values())
+        plain, largest = replace(problem, theta=Tunables()), problem.current_max_A
         table: dict[str, Callable[[], RangeRow]] = {
-            CCCV: lambda: self._fastest(name),
+            CCCV: lambda: self._fastest(name, (largest,)),
+            STEPS: lambda: self._fastest(name, [share * largest for share in STEP_SHARES]),
             "nominal MPC": lambda: self._controlled(name, problem, problem.space.default),
             FEEDBACK: lambda: self._controlled(name, with_feedback(problem), []),
             "best constant backoff": lambda: self._backoff(name, plain),
@@ -135,7 +140,7 @@ class _Drawn:
             "MPC that knows each plant": lambda: RangeRow(
                 name, tuple(self._score(_knowing(knowing_the_plant(plain), one)) for one in self.plants)
             ),
-            ORACLE: lambda: RangeRow(name, tuple(self._stepped(one, 1.0, list(problem.limits_by_name.values())) for one in self.plants)),
+            ORACLE: lambda: RangeRow(name, tuple(self._stepped(one, constant_current(largest), every) for one in self.plants)),
         }
         return table[name]()
 
@@ -154,15 +159,15 @@ class _Drawn:
 
         return smallest_that_keep(run, backoffs.limits, backoffs.largest, backoffs.tolerances)
 
-    def _fastest(self, name: str) -> RangeRow:
-        """CC-CV at the largest rate with which every limit is kept on all plants, by bisection."""
+    def _fastest(self, name: str, currents_A: Sequence[float]) -> RangeRow:
+        """Constant currents in as many SOC windows, times the largest share with which every limit is kept on all plants, by bisection."""
         voltage = [self.problem.limits_by_name["voltage_max_V"]]
         known: dict[tuple[float, int], Score | None] = {}
         order = list(range(len(self.plants)))
 
         def score(share: float, i: int) -> Score | None:
             if (share, i) not in known:
-                known[share, i] = self._stepped(self.plants[i], share, voltage)
+                known[share, i] = self._stepped(self.plants[i], multi_step([share * one for one in currents_A]), voltage)
             return known[share, i]
 
         def kept(share: float) -> bool:
@@ -176,15 +181,15 @@ class _Drawn:
             return True
 
         share = largest_share(kept)
-        return RangeRow(name, tuple(score(share, i) for i in range(len(self.plants))), f"{share * self.problem.current_max_A:.3g} A")
+        ends = dict.fromkeys((f"{share * currents_A[0]:.3g}", f"{share * currents_A[-1]:.3g}"))
+        return RangeRow(name, tuple(score(share, i) for i in range(len(self.plants))), f"{' to '.join(ends)} A")
 
-    def _stepped(self, one: DrawnPlant, share: float, limits: Sequence[Limit]) -> Score | None:
+    def _stepped(self, one: DrawnPlant, law: CurrentLaw, limits: Sequence[Limit]) -> Score | None:
         problem, stepped = self.problem, as_steppable(self.use.plant_of(one))
         if stepped is None:
             raise ValueError("the next interval of this plant cannot be tried")
-        largest = problem.current_max_A
-        law, steps, target = constant_current(share * largest), problem.episode.steps, problem.episode.soc_target
-        return self._score(charge(stepped, law, limits, steps=steps, soc_target=target, current_max_A=largest))
+        steps, target = problem.episode.steps, problem.episode.soc_target
+        return self._score(charge(stepped, law, limits, steps=steps, soc_target=target, current_max_A=problem.current_max_A))
 
 
 def _knowing(plain: ChargingProblem, one: DrawnPlant) -> Episode:
