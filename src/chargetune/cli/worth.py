@@ -45,7 +45,9 @@ def show_worth(location: str, *, study: str | None, as_json: bool) -> None:
         raise ValueError(f"--worth: study {record.name!r} has no result yet, allowed is one that has")
     loop = ChargingRange(problem)
     plants = loop.draw(WORTH_DRAWS, WORTH_SEED)
-    worths = entry_worths(RangeEvaluation(loop), problem.space, np.array(best.theta), plants)
+    worths = entry_worths(
+        RangeEvaluation(loop, objective_quantile=problem.range.objective_quantile), problem.space, np.array(best.theta), plants
+    )
     if as_json:
         print(json.dumps({"study": record.name, "trial": best.number, "draws": WORTH_DRAWS, "worths": [asdict(w) for w in worths]}))  # noqa: T201
         return

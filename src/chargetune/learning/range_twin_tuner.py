@@ -15,7 +15,7 @@ from chargetune.episode.score import Score
 from chargetune.learning.range_of_use.conditioned_range import ConditionedRange
 from chargetune.learning.range_of_use.range_tuner import RangeSettings, RangeTuner
 from chargetune.learning.range_of_use.range_twin import RangeTwinLoop
-from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
+from chargetune.learning.range_of_use.range_verdict import RangeEvaluation, check_quantile
 from chargetune.learning.safety import NoSafeThetaError, Safety
 from chargetune.learning.tuner import TrialLike, check_count
 from chargetune.learning.twin.ensemble import Learnt, episodes_of, learn
@@ -64,6 +64,8 @@ class RangeTwinSettings:
     contradicted
         Share of the draws from which a charge that kept its limits contradicts them: if fewer keep them, such a charge had that small a
         chance.
+    objective_quantile
+        As of `RangeEvaluation`: what theta is chosen for on the draws.
     twin
         Settings of the posterior and of the discrepancy. Episodes begin differently, so that each has an error of its own.
     """
@@ -74,6 +76,8 @@ class RangeTwinSettings:
     first: RangeSettings = field(default_factory=RangeSettings)
     later: RangeSettings = field(default_factory=lambda: RangeSettings(plants=32, pool=8, iterations=12))
     twin: TwinSettings = field(default_factory=lambda: TwinSettings(of_episode=0.1))
+    # A study's configuration has it.
+    objective_quantile: float | None = field(default=None, metadata={"identity": False})
 
     def __post_init__(self) -> None:
         for name in ("rounds", "judges"):
@@ -83,6 +87,7 @@ class RangeTwinSettings:
         share = self.contradicted
         if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share < 1:
             raise ValueError(f"range twin settings: contradicted = {share!r}, allowed is [0, 1)")
+        check_quantile("range twin settings", self.objective_quantile)
 
 
 @dataclass(frozen=True)
@@ -168,7 +173,7 @@ class RangeTwinTuner:
     def _next(self, space: ParameterSpace, learnt: Learnt, done: Sequence[TrialLike]) -> Proposed:
         last, number, score = np.array(done[-1].theta), len(done), done[-1].score
         whole = ConditionedRange(self.loop, learnt, last, np.ones(len(last), dtype=bool))
-        evaluation, seed = RangeEvaluation(whole, self.settings.judges), self._seed(number, self.settings.rounds)
+        evaluation, seed = self._evaluation(whole), self._seed(number, self.settings.rounds)
         share, value = _judged(evaluation(last, seed)[0])
         if share < self.settings.contradicted and score is not None and score.feasible:
             why = f"it kept every limit, which it does on {share:.3f} of the draws: these are not of this plant"
@@ -184,11 +189,14 @@ class RangeTwinTuner:
         share, _ = _judged(evaluation(first, seed)[0])
         return Proposed(tuple(first), Choice.REPEATED, share, f"the first one keeps every limit on {share:.3f} of them")
 
+    def _evaluation(self, loop: ConditionedRange) -> RangeEvaluation:
+        return RangeEvaluation(loop, self.settings.judges, self.settings.objective_quantile)
+
     def _search(
         self, space: ParameterSpace, loop: ConditionedRange, settings: RangeSettings, number: int
     ) -> tuple[tuple[float, ...], float, float]:
         """The best theta of several rounds, the share of fresh draws that it keeps every limit on, and its objective."""
-        part, evaluation, rounds = loop.space(space), RangeEvaluation(loop, self.settings.judges), list[_Round]()
+        part, evaluation, rounds = loop.space(space), self._evaluation(loop), list[_Round]()
         tuner = RangeTuner(evaluation, self._seed(number, -1), settings)
         for k in range(self.settings.rounds):
             # Later rounds only mend what the first one left.

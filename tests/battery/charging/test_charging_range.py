@@ -30,7 +30,7 @@ def drawn(settings, cell=CELL, count=64, **entries):
 
 def test_every_entry_has_a_bound_and_a_meaning():
     # What says nothing of the plants.
-    own = ("draws", "drop_idle", "cell")
+    own = ("draws", "drop_idle", "cell", "objective_quantile")
     assert {*MOST, *PAIRS, "cells", "node_correlation", *own} == {part.name for part in fields(ChargingRangeSettings)} == {*MEANING, *own}
 
 

@@ -137,8 +137,25 @@ def test_the_score_is_that_of_all_plants_counted_by_hand():
     assert score.metrics["violating_plants"] == np.sum(levels.max(axis=1) - LIMIT > TOLERANCE)
     assert score.metrics["objective_worst"] == pytest.approx(levels.mean(axis=1).min(), rel=1e-5)
     np.testing.assert_allclose(worst.signal("T")[1], levels[np.argmax(levels.max(axis=1))], rtol=1e-5)
-    least, _, _ = ct.RangeEvaluation(loop(), 50, aim="worst")(theta, 7)
-    assert least.objective == pytest.approx(levels.mean(axis=1).min(), rel=1e-5)
+    for quantile, share in ((1.0, 0.0), (0.9, 0.1), (0.0, 1.0)):
+        least, _, _ = ct.RangeEvaluation(loop(), 50, objective_quantile=quantile)(theta, 7)
+        assert least.objective == pytest.approx(np.quantile(levels.mean(axis=1), share), rel=1e-5)
+
+
+def test_a_theta_for_the_slowest_plant_is_another_one_than_for_the_mean():
+    """Two kinds of plant, one with T = gain u, one with T = gain (2 - u): the mean wants u where most gain is, the slowest u = 1."""
+    mirrored = ct.Model.build(
+        "mirrored", states=(ct.Signal("T", "K"),), inputs=(ct.Signal("u"),), outputs=(ct.Signal("T", "K"),),
+        parameters={"rising": 1.0, "falling": 0.0}, sampling_time_s=1.0,
+        equations=lambda x, u, p: ({"T": p["rising"] * u["u"] + p["falling"] * (2.0 - u["u"])}, {"T": x["T"]}),
+    )  # fmt: skip
+    # Draws of both kinds, four of five of the first.
+    kinds = [ct.SimulatedPlant(mirrored.with_parameters(rising=r, falling=f), {}) for r, f in [(1.0, 0.0)] * 4 + [(0.0, 1.0)]]
+    use = ct.OwnDraws(kinds[0], lambda rng: kinds[rng.integers(5)])
+    wide = ct.SimulatedRange(BLIND, use, STEPS, (ct.ScoredLimit("T", upper=9.0, tolerance=TOLERANCE),), heat)
+    found = {q: ct.RangeTuner(ct.RangeEvaluation(wide, 20, objective_quantile=q), seed=0).ask(SPACE, [])[0][0] for q in (None, 1.0)}
+    assert found[None] == pytest.approx(2.0, abs=1e-3)
+    assert found[1.0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_it_is_a_pure_function_of_its_trials():
@@ -177,7 +194,10 @@ def test_run_plants_is_the_same_in_batches_as_one_by_one():
     ("make", "message"),
     [
         (lambda: ct.RangeEvaluation(loop(), 0), "plants = 0, allowed is an integer >= 1"),
-        (lambda: ct.RangeEvaluation(loop(), 5, aim="median"), "aim = 'median', allowed is 'mean' or 'worst'"),
+        (
+            lambda: ct.RangeEvaluation(loop(), 5, objective_quantile=1.5),
+            r"objective_quantile = 1.5, allowed is \[0, 1\], or None for the mean",
+        ),
         (lambda: ct.RangeSettings(plants=0), "plants = 0"),
         (lambda: ct.RangeSettings(aim=1.5), r"aim = 1.5, allowed is \[0, 1\]"),
     ],

@@ -60,6 +60,9 @@ class ChargingRangeSettings:
         every charge, and only what is of a charge differs. The stand-in of a real cell for the tuner "twin". None: all cells.
     draws
         Fresh draws of one trial of the tuner "range": where 0.3 % of all plants break a limit, 1000 show one with probability 0.95.
+    objective_quantile
+        What theta is chosen for over the plants: none: the mean of the objective; 0.9: what 90 % of them have at least, as a charging time
+        that they need at most; 1: the slowest of them.
     drop_idle
         The tuner "range" puts entries of theta back that are worth nothing: no more plants break a limit, and no time is lost.
 
@@ -82,6 +85,8 @@ class ChargingRangeSettings:
     """One cell of the range, by the seed that draws it; by default all of them."""
     draws: int = 1000
     """Fresh draws of one trial of the tuner "range"."""
+    objective_quantile: float | None = None
+    """Share of the plants that have the objective that theta is chosen for, or a better one; by default their mean. 1: the slowest."""
     drop_idle: bool = False
     """Whether entries of theta that are worth nothing are put back and left out of the search."""
 
@@ -100,6 +105,8 @@ class ChargingRangeSettings:
         check_number("range: voltage_bias_V", self.voltage_bias_V, 0.0, 0.1, "V")
         if isinstance(self.draws, bool) or not isinstance(self.draws, int) or not 1 <= self.draws <= DRAWS_MAX:
             raise ValueError(f"range: draws = {self.draws!r}, allowed is an integer in [1, {DRAWS_MAX}]")
+        if self.objective_quantile is not None:
+            check_number("range: objective_quantile", self.objective_quantile, 0.0, 1.0)
         if not isinstance(self.drop_idle, bool):
             raise ValueError(f"range: drop_idle = {self.drop_idle!r}, allowed is true or false")
         if self.cell is not None and (isinstance(self.cell, bool) or not isinstance(self.cell, int) or self.cell < 0):

@@ -42,7 +42,7 @@ def _over_range(problem: ChargingProblem) -> RangeEvaluation:
         raise ValueError("tuner = 'range' is given with an electrochemical [plant], allowed is a circuit, of which hundreds are drawn")
     from chargetune import learning
 
-    return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws)
+    return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws, problem.range.objective_quantile)
 
 
 def make_tuner(
@@ -75,7 +75,9 @@ def make_tuner(
         of_range = ChargingRangeTwin(problem, _model_spread(problem, unknown))
         if of_range.unpredicted:
             raise ValueError(_unpredicted("tuner = 'twin' is given with a table [range]", of_range.unpredicted))
-        return learning.RangeTwinTuner(of_range, seed=seed, safety=safe or learning.Safety())
+        quantile = problem.range.objective_quantile
+        settings = learning.RangeTwinSettings(objective_quantile=quantile)
+        return learning.RangeTwinTuner(of_range, seed=seed, safety=safe or learning.Safety(), settings=settings)
     known = unknown or TwinTable()
     twin = ChargingTwin(
         problem,

@@ -257,7 +257,7 @@ class Config(_Table):
         if self.range is None:
             return {}
         table: dict[str, Any] = json.loads(json.dumps(asdict(self.range)))
-        for name in ("cell", "drop_idle", *ADDED):
+        for name in ("cell", "drop_idle", "objective_quantile", *ADDED):
             if table[name] == getattr(ChargingRangeSettings(), name):
                 del table[name]
         if not self.range.cells:

@@ -79,7 +79,7 @@ class RangeTuner:
 
         max over theta of mean_j J_j(theta)  s.t.  e_jk(theta) + m <= aim * tolerance  for every sample k of every plant j chosen on
 
-    (or the worst J_j) by `solve_slp`. The first theta is chosen on `RangeSettings.plants` draws, with the margin m = 0; each trial
+    (or a quantile of J_j) by `solve_slp`. The first theta is chosen on `RangeSettings.plants` draws, with the margin m = 0; each trial
     tries a theta on fresh draws. Those on which it was nearest to a limit join the rows, not the mean (the scenario approach with
     sampling and discarding none: Calafiore and Campi, IEEE Trans. Autom. Control 51 (2006) 742). m is by how much their worst excess
     is above the least of theirs, the median over ln 2: the scale of the tail, if it is exponential, beyond what was drawn; one plant that
@@ -222,7 +222,7 @@ class _RangeSearch:
         known = [one for one in found if one is not None]
         # The worst plants of trials are no fair sample of what a theta is worth.
         common = [worth for _, worth in (known[self._added :] if first is None else known)]
-        return Point(-objective_over(self._evaluation.aim, common), np.concatenate([rows for rows, _ in known]))
+        return Point(-objective_over(self._evaluation.objective_quantile, common), np.concatenate([rows for rows, _ in known]))
 
     def _of_each(
         self, u: NDArray[np.float64], plants: Sequence[DrawnPlant], left: Sequence[float]

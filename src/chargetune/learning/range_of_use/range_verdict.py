@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,8 @@ from chargetune.learning.range_of_use.range_loop import RangeLoop
 from chargetune.plants.range_of_use import DrawnPlant
 from chargetune.runtime.counted import counted
 
-__all__ = ["Aim", "PlantResult", "RangeEvaluation", "objective_over", "run_plants"]
+__all__ = ["PlantResult", "RangeEvaluation", "check_quantile", "objective_over", "run_plants"]
 
-Aim = Literal["mean", "worst"]
 # Episodes that are simulated together: what they recorded has to fit into memory.
 BATCH = 64
 
@@ -46,9 +44,15 @@ def run_plants(loop: RangeLoop, theta: NDArray[np.float64], plants: Sequence[Dra
     return out
 
 
-def objective_over(aim: Aim, values: Sequence[float]) -> float:
-    """What a theta is worth over plants: their mean, or the worst of them."""
-    return float(np.mean(values) if aim == "mean" else np.min(values))
+def objective_over(quantile: float | None, values: Sequence[float]) -> float:
+    """What a theta is worth over plants: their mean, or with a ``quantile`` what this share of them has at least; 1: the worst of them."""
+    return float(np.mean(values) if quantile is None else np.quantile(values, 1.0 - quantile))
+
+
+def check_quantile(where: str, quantile: float | None) -> None:
+    """Raises ValueError unless this is None or a number in [0, 1]."""
+    if quantile is not None and (isinstance(quantile, bool) or not isinstance(quantile, (int, float)) or not 0 <= quantile <= 1):
+        raise ValueError(f"{where}: objective_quantile = {quantile!r}, allowed is [0, 1], or None for the mean")
 
 
 @dataclass(frozen=True)
@@ -56,20 +60,23 @@ class RangeEvaluation:
     """What a study runs: a trial is one theta on ``plants`` draws that are made of the trial's own seed.
 
     So no draw that chose a theta judges it. The score's objective is that over the plants, its excesses are the worst of any plant;
-    ``metrics`` hold how many plants broke a limit, of how many, and every figure of
-    the plants as mean, or as largest (`RangeLoop.largest_of`). The trace is that of the plant
-    with the largest excess; all others follow from the seed. A plant whose episode did not come to its end fails the trial.
+    ``metrics`` hold how many plants broke a limit, of how many, and every figure of the plants as mean, or as largest
+    (`RangeLoop.largest_of`). The trace is that of the plant with the largest excess; all others follow from the seed. A plant whose
+    episode did not come to its end fails the trial.
+
+    objective_quantile
+        None: the objective is the mean over the plants. Else what so large a share of them has at least; of a charging time what this
+        share needs at most. 1: the worst of them.
     """
 
     loop: RangeLoop
     plants: int = 1000
-    aim: Aim = "mean"
+    objective_quantile: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.plants, bool) or not isinstance(self.plants, int) or self.plants < 1:
             raise ValueError(f"range evaluation: plants = {self.plants!r}, allowed is an integer >= 1")
-        if self.aim not in ("mean", "worst"):
-            raise ValueError(f"range evaluation: aim = {self.aim!r}, allowed is 'mean' or 'worst'")
+        check_quantile("range evaluation", self.objective_quantile)
 
     def results(self, theta: NDArray[np.float64], seed: int) -> list[PlantResult]:
         """Every plant of the trial with this seed."""
@@ -100,8 +107,8 @@ class RangeEvaluation:
             over = max if name in self.loop.largest_of else np.mean
             metrics[name] = float(over(values)) if len(values) == len(scores) else None
         return Score(
-            objective=objective_over(self.aim, [score.objective for score in scores]),
-            performance=objective_over(self.aim, [score.performance for score in scores]),
+            objective=objective_over(self.objective_quantile, [score.objective for score in scores]),
+            performance=objective_over(self.objective_quantile, [score.performance for score in scores]),
             excess={name: max(score.excess[name] for score in scores) for name in scores[0].excess},
             tolerance=dict(scores[0].tolerance),
             metrics=metrics,

@@ -80,7 +80,7 @@ def _verdict(evaluation: RangeEvaluation, theta: NDArray[np.float64], plants: Se
     scores = [one.score for one in run_plants(evaluation.loop, theta, plants)]
     known = [score.objective for score in scores if score is not None]
     violating = sum(score is None or not score.feasible for score in scores)
-    return violating, objective_over(evaluation.aim, known) if known else -np.inf
+    return violating, objective_over(evaluation.objective_quantile, known) if known else -np.inf
 
 
 def _without(space: ParameterSpace, theta: NDArray[np.float64], i: int) -> Iterator[tuple[str, NDArray[np.float64]]]:
