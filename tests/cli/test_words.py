@@ -10,6 +10,7 @@ from rich.console import Console
 from chargetune.battery.baselines.comparison import Row
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.evaluate import evaluate
+from chargetune.battery.charging.range_settings import ChargingRangeSettings
 from chargetune.battery.charging.settings import SensorSettings
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.wording import METRIC_WORDS, limit_words, metric_words, objective_words
@@ -67,6 +68,14 @@ def test_a_time_that_was_not_reached_is_no_time(problem):
     assert words.text(0.4) == "24.00"
     # 1 + z* - z_K is the loss of a charge that ends below z*.
     assert words.text(1.1) == "> 60"
+
+
+def test_an_objective_over_a_range_says_of_which_plants_it_is(problem):
+    for quantile, label in ((None, ""), (0.9, ", 90 % quantile of the plants"), (1.0, ", slowest plant")):
+        over = replace(problem, range=ChargingRangeSettings(resistance=0.1, objective_quantile=quantile))
+        assert objective_words(over, "range").label == f"time to 80 % SOC{label}"
+        # A charge of one cell is no quantile of anything.
+        assert objective_words(over, "twin").label == "time to 80 % SOC"
 
 
 @pytest.mark.parametrize(

@@ -111,11 +111,14 @@ def objective_words(problem: ChargingProblem, tuner: str = "") -> ObjectiveWords
     """What the loss of a charging study is: minutes to a SOC, the mean squared deficit, or with the tuner "ei" -G."""
     if tuner == "ei":
         return ObjectiveWords("-G", "-G")
-    mark = problem.objective.charge_time_to_soc
+    mark, of = problem.objective.charge_time_to_soc, ""
+    quantile = problem.range.objective_quantile if problem.range and tuner == "range" else None
+    if quantile is not None:
+        of = ", slowest plant" if quantile == 1 else f", {100 * quantile:.3g} % quantile of the plants"
     if mark is None:
-        return ObjectiveWords("mean of (z_d - z)^2", "mean (z_d - z)^2")
+        return ObjectiveWords(f"mean of (z_d - z)^2{of}", "mean (z_d - z)^2")
     minutes = problem.episode.steps * problem.controller.sampling_time_s / 60
-    return ObjectiveWords(f"time to {100 * mark:.3g} % SOC", f"t{100 * mark:.3g}", "min", minutes, minutes)
+    return ObjectiveWords(f"time to {100 * mark:.3g} % SOC{of}", f"t{100 * mark:.3g}", "min", minutes, minutes)
 
 
 def metric_words(name: str) -> tuple[str, str]:
