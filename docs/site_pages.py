@@ -15,7 +15,7 @@ PAGES = {
 # The scripts of examples/gallery as a reader would take them: a cell, learning, a range of use, other systems, one's own parts, machines.
 GALLERY = (
     *("pulses_to_cell", "case_study", "feedback_or_learning", "safe_charges", "unmeasured_limit"),
-    *("range_of_use", "theta_over_temperature", "certificate"),
+    *("range_of_use", "measured_cells", "theta_over_temperature", "certificate"),
     *("crane", "stirred_tank", "building", "gymnasium_plant", "own_estimator"),
     *("dask_workers", "postgresql_live"),
 )
