@@ -2,9 +2,8 @@
 A range from measured cells
 ===========================
 
-Six cells of one make were pulsed. How much does the next one differ? `cells = "folder"` in the table `[range]` draws it: resistances,
-capacitances and capacity are correlated as they are among the measured cells, and Student's t says how little six cells know.
-The six files are made here; yours come from `chargetune identify pulses.csv -o cells/1.toml` and so on.
+Six cells of one make were pulsed. How much does the next one differ? `cells = "folder"` in the table `[range]` draws it, with R, C and
+capacity correlated as among the measured cells. The six files are made here; yours come from `chargetune identify`.
 """
 
 import tempfile
@@ -35,14 +34,12 @@ study = { name = "make", tuner = "range" }
 controller = { mismatch_seed = 1, current_ramp_A_s = 0.1 }
 estimator = { kind = "adaptive", adaptive = { soc = "measured", backoff_sd = 0.1 } }
 episode = { steps = 240 }
-objective = { charge_time_to_soc = 0.8 }
 range = { cells = "cells", soc_start = [0.05, 0.5], draws = 100 }
 theta = { backoff = { nodes = 2, lower_V = 0.0, upper_V = 0.1 } }
 """
 (folder / "study.toml").write_text(STUDY)
 config = ct.load_config(folder / "study.toml")
-problem = config.problem(folder)
-evaluation = ct.evaluation_of("range", problem)
+evaluation = ct.evaluation_of("range", problem := config.problem(folder))
 with ct.Store(folder / "study.sqlite") as store, ct.open_study(store, config, folder) as study:
     thetas = {"untuned": problem.space.default, "tuned": study.run(evaluation, 2).theta}
 
@@ -59,6 +56,5 @@ for name, theta in thetas.items():
 for values, color in ((tables, "0.8"), ([1e3 * np.array(one.R0_ohm) for one in measured], "C0")):
     table.plot(100 * np.array(known.soc), np.transpose(values), color=color)
 table.set(xlabel="SOC (%)", ylabel="R0 (mΩ)", title="six measured cells (blue), a hundred drawn ones")
-excess.axhline(0, color="black", linestyle=":")
 excess.set(xlabel="mean R0 of the drawn cell (mΩ)", ylabel="largest voltage beyond 4.2 V (mV)")
 figure.legend(loc="outside upper right")
