@@ -1,11 +1,15 @@
 """check, certify and verify as a user runs them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import tuned
 
+from chargetune.battery.cell.cell import default_cell
+from chargetune.battery.identification.pulse_fit import cell_toml
 from study_text import study_text
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
@@ -172,12 +176,31 @@ def test_certify_and_verify(chargetune_here, store, tmp_path):
         (("--soc-start", "0.1", "0.9"), "range: soc_start = [0.1, 0.9], allowed is less than the SOC that is charged to, 0.8"),
         (("--ambient-K", "280", "300"), "range: ambient_K = [280.0, 300.0], allowed only for a cell with a [thermal] table"),
         (("-o", "c.txt"), "c.txt"),
+        (("--cells", "nowhere"), "cells = 'nowhere', allowed is a folder of cell files"),
+        (("--node-correlation", "1"), "range: node_correlation = 1.0, allowed is [0, 0.99]"),
     ],
 )
 def test_certify_refuses(arguments, words, chargetune_here, store):
     code, _, err = chargetune_here("certify", store, *arguments)
     assert code == 2
     assert words in err
+
+
+def test_a_theta_is_certified_for_other_cells_than_it_was_tuned_for(chargetune_here, store, tmp_path):
+    for number, factor in enumerate((0.99, 1.0, 1.02)):
+        cell = replace(default_cell(), name=f"cell {number}", R0_ohm=tuple(factor * np.array(default_cell().R0_ohm)))
+        (tmp_path / f"{number}.toml").write_text(cell_toml(cell))
+    # Nothing that is read is written, whatever it is called.
+    code, _, err = chargetune_here("certify", store, "--cells", tmp_path, "-o", tmp_path / "1.toml", "--overwrite")
+    assert code == 2
+    assert "1.toml" in err
+    target = tmp_path / "c.json"
+    code, out, _ = chargetune_here("certify", store, "--cells", tmp_path, "--episodes", 3, "-o", target, "--json")
+    assert code == 0
+    told = json.loads(out)
+    assert told["range"]["cells"] == tmp_path.name
+    assert "3 cells: cell 0, cell 1, cell 2" in told["drawn"]
+    assert chargetune_here("verify", target)[0] == 0
 
 
 def test_a_study_without_a_trial_that_kept_the_limits_is_not_certified(chargetune_here, study, tmp_path):

@@ -12,6 +12,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from chargetune.battery.cell.cell import load_cells
 from chargetune.battery.certification.certificate import Charge, run_charges, write_certificate
 from chargetune.battery.certification.default_range import default_range
 from chargetune.battery.charging.problem import ChargingProblem
@@ -39,6 +40,7 @@ def certify_command(
     seed: int,
     confidence: float,
     changes: Mapping[str, Any],
+    cells: Path | None,
     workers: int,
     output: Path | None,
     overwrite: bool,
@@ -46,7 +48,7 @@ def certify_command(
 ) -> None:
     """Run the theta of a trial, or of the study's result, on fresh episodes of the study's range and write the certificate.
 
-    ``changes`` are entries of the range that the certificate has another value of.
+    ``changes`` are entries of the range that the certificate has another value of, ``cells`` a folder of cell files.
     """
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"--confidence = {confidence:g}, allowed is (0, 1)")
@@ -72,12 +74,12 @@ def certify_command(
         raise ValueError(f"{store.label}: study {record.name!r} has no trial with a score, so there is nothing to certify")
     if "cell" not in record.identity["config"]:
         raise ValueError(f"{store.label}: study {record.name!r} is not one of battery charging")
-    problem, whose = _with_range(problem_of_document(record.identity["config"]), changes)
+    problem, whose = _with_range(problem_of_document(record.identity["config"]), changes, cells)
     target = output or beside(location, "-certificate.json")
     if target.suffix != ".json":
         raise ValueError(f"--output {target}: allowed is a file name that ends in .json")
     outputs = [Output("--output", target, Kind.CERTIFICATE), Output("--output's figure", target.with_suffix(".png"), Kind.PNG)]
-    claim(outputs, inputs=[location], overwrite=overwrite)
+    claim(outputs, inputs=[location, *(cells.glob("*.toml") if cells else ())], overwrite=overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     charges: list[Charge] = []
     workers = workers_for(workers, episodes, ("episode", "episodes"))
@@ -122,12 +124,15 @@ def certify_command(
     screen.print(line, style="dim", markup=False, soft_wrap=True)
 
 
-def _with_range(problem: ChargingProblem, changes: Mapping[str, Any]) -> tuple[ChargingProblem, str]:
+def _with_range(problem: ChargingProblem, changes: Mapping[str, Any], cells: Path | None) -> tuple[ChargingProblem, str]:
     """The problem with the range that is certified, and where that is from."""
     given = {name: value for name, value in changes.items() if value is not None}
+    if cells is not None:
+        given["cells"] = cells.resolve().name
     whose = "the default, since the study has no table [range]" if problem.range is None else "the study's [range]"
     settings = replace(problem.range or default_range(problem), **given)
-    return replace(problem, range=settings), whose + (f", with other {', '.join(given)}" if given else "")
+    changed = replace(problem, range=settings, range_cells=problem.range_cells if cells is None else load_cells(cells))
+    return changed, whose + (f", with other {', '.join(given)}" if given else "")
 
 
 def _print(certificate: dict[str, Any]) -> None:

@@ -104,7 +104,7 @@ def test_what_the_cells_have_and_the_study_has_not_is_refused():
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ('cells = "nowhere"', "range.cells = .*nowhere.*, allowed is a folder of cell files"),
+        ('cells = "nowhere"', "range: cells = .*nowhere.*, allowed is a folder of cell files"),
         ('cells = ""', "cells = '', allowed is a folder of cell files"),
         ("cells = 3", "range.cells = 3, allowed is text in quotes"),
         ("node_correlation = 0.5", "node_correlation = 0.5, allowed only with resistance_by_node or capacitance_by_node"),

@@ -31,6 +31,7 @@ __all__ = [
     "default_cell",
     "highest_voltage",
     "load_cell",
+    "load_cells",
     "mismatched",
 ]
 
@@ -239,6 +240,13 @@ def highest_voltage(full_V: float) -> float:
 def load_cell(path: str | Path) -> Cell:
     """Read a cell file (TOML). Raises ValueError naming the file and the field at fault, FileNotFoundError."""
     return _read(Path(path).read_bytes(), str(path))
+
+
+def load_cells(folder: str | Path) -> tuple[Cell, ...]:
+    """Read all cell files (*.toml) of a folder, by name. Raises ValueError where it is none, and as `load_cell`."""
+    if not Path(folder).is_dir():
+        raise ValueError(f"cells = {str(folder)!r}, allowed is a folder of cell files")
+    return tuple(load_cell(path) for path in sorted(Path(folder).glob("*.toml")))
 
 
 def default_cell() -> Cell:

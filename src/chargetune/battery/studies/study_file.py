@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, PrivateAttr, Tag, ValidationError, field_validator
 
-from chargetune.battery.cell.cell import PACK, PACK_MAX, Cell, default_cell, load_cell
+from chargetune.battery.cell.cell import PACK, PACK_MAX, Cell, default_cell, load_cell, load_cells
 from chargetune.battery.cell.plating import Anode
 from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.kalman import Kalman
@@ -271,10 +271,10 @@ class Config(_Table):
     def _range_cells(self, folder: Path | None) -> tuple[Cell, ...]:
         if self.range is None or not self.range.cells:
             return ()
-        place = _beside(folder, self.range.cells)
-        if not place.is_dir():
-            raise ValueError(f"range.cells = {str(place)!r}, allowed is a folder of cell files")
-        return tuple(load_cell(path) for path in sorted(place.glob("*.toml")))
+        try:
+            return load_cells(_beside(folder, self.range.cells))
+        except ValueError as error:
+            raise ValueError(f"range: {error}") from None
 
     def _plant(self, folder: Path | None) -> Plant | None:
         plant = self.plant
