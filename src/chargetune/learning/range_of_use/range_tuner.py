@@ -127,17 +127,22 @@ class RangeTuner:
         return search, u
 
     def _mended(self, search: _RangeSearch, u: NDArray[np.float64]) -> tuple[_RangeSearch, NDArray[np.float64]]:
-        """Where a search ended beyond a tolerance: the same from the best of a few points on all plants.
+        """Where a search ended beyond a tolerance on a drawn plant: the same from the best of a few points on all plants.
 
-        Where the input is saturated a violation has no slope, and beside one that is not mended all others are let grow as large. What a
-        plant has left at its best point of these is left behind.
+        Where the input is saturated a violation has no slope, and beside one that is not mended all others are let grow as large. If that
+        mends it not, what each plant has left at its best point is left behind, where so fewer plants are beyond a tolerance.
         """
-        if search.violation_of_all(u) <= 1.0 - self.settings.aim:
+        if not search.broken(u):
             return search, u
         points = [u, np.zeros(u.size), np.ones(u.size), *sobol_points(u.size, self.seed, 0, self.settings.pool)]
-        search = search.leaving_behind(points)
         begin = min(points, key=search.merit_of_all)
-        return search, min(u, search.refine(begin), key=search.merit_of_all)
+        if begin is not u:
+            points[0] = u = min(u, search.refine(begin), key=search.merit_of_all)
+        if not search.broken(u):
+            return search, u
+        relaxed = search.leaving_behind(points)
+        found = relaxed.refine(min(points, key=relaxed.merit_of_all))
+        return (relaxed, found) if search.broken(found) < search.broken(u) else (search, u)
 
     def _worst(self, trial: TrialLike) -> list[PlantResult]:
         """The plants of a trial that say the most about the limits, the worst first."""
@@ -188,10 +193,9 @@ class _RangeSearch:
         """The same on all plants."""
         return _merit(self._point(u))
 
-    def violation_of_all(self, u: NDArray[np.float64]) -> float:
-        """The largest of all plants; inf where one has no verdict."""
-        point = self._point(u)
-        return np.inf if point is None else point.violation
+    def broken(self, u: NDArray[np.float64]) -> int:
+        """On how many plants a limit is broken by more than its tolerance, or there is no verdict."""
+        return int(np.sum(self.violations(u, self.plants) > 1.0 - self._settings.aim + self._margin))
 
     def violations(self, u: NDArray[np.float64], plants: Sequence[DrawnPlant], left: Sequence[float] | None = None) -> NDArray[np.float64]:
         """That of each of these plants; inf where it has no verdict."""
