@@ -55,7 +55,7 @@ def test_counts_and_times_of_a_bar_stand_whole_at_80_columns(done):
     assert max(map(len, text.splitlines())) <= 80
 
 
-@pytest.mark.parametrize("best", ["t95 137.11 min (trial 299)", ""])
+@pytest.mark.parametrize("best", ["best t95 137.11 min (trial 299)", ""])
 @pytest.mark.parametrize("failures", [0, 12])
 @pytest.mark.parametrize("total", [60, 300])
 def test_the_bar_of_a_study_is_one_line_at_80_columns(best, failures, total):

@@ -11,7 +11,7 @@ from chargetune.battery.baselines.comparison import Row
 from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.charging.evaluate import evaluate
 from chargetune.battery.charging.range_settings import ChargingRangeSettings
-from chargetune.battery.charging.settings import SensorSettings
+from chargetune.battery.charging.settings import SafetySettings, SensorSettings
 from chargetune.battery.charging.tunables import ResistanceRatio
 from chargetune.battery.charging.wording import METRIC_WORDS, limit_words, metric_words, objective_words
 from chargetune.cli.compare import _table as _compare_table
@@ -106,6 +106,11 @@ def test_only_theta_0_is_untuned():
     space = problem.space
     assert _start_label(problem, [Trial(0, tuple(space.default))]) == "untuned"
     assert _start_label(problem, [Trial(0, tuple(space.upper))]) == "trial 0"
+    safe = replace(problem, safety=SafetySettings())
+    assert _start_label(safe, [Trial(0, tuple(space.upper))]) == "cautious start"
+    # Over a range the first theta is chosen for all of it.
+    over = replace(safe, range=ChargingRangeSettings(resistance=0.1))
+    assert _start_label(over, [Trial(0, tuple(space.upper))]) == "trial 0"
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ from chargetune.learning.range_of_use.conditioned_range import ConditionedRange
 from chargetune.learning.range_of_use.range_prior import RangePrior
 from chargetune.learning.range_twin_tuner import Choice
 from chargetune.learning.twin.ensemble import learn
+from chargetune.study.result import by_newest
+from chargetune.study.serialization import describe
 
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
@@ -81,6 +83,12 @@ def test_the_same_trials_give_the_same_theta_and_a_batch_repeats_it():
     trials, choices = told(TUNER, 2)
     again = ct.RangeTwinTuner(LOOP, settings=SETTINGS).ask(SPACE, trials[:1], 2)
     np.testing.assert_array_equal(again, np.tile(choices[1].theta, (2, 1)))
+
+
+def test_the_result_of_its_study_is_the_newest_trial_that_kept_the_limits():
+    """Episodes begin in conditions of their own: the best objective is that of the best start."""
+    assert by_newest({"tuner": describe(TUNER)})
+    assert not by_newest({"tuner": describe(ct.RangeTuner(ct.RangeEvaluation(LOOP, 4)))})
 
 
 def test_a_declared_start_is_tried_first_and_no_search_is_made():

@@ -66,6 +66,16 @@ def test_a_belief_does_not_overrule_what_was_measured_beyond_doubt():
     assert decided([done(0, -8.58, -0.5), done(1, -4.38, -0.02), done(2, -4.0, 0.005)], 1) == (1, Reason.BELIEVED)
 
 
+def test_of_trials_under_conditions_of_their_own_the_newest_that_kept_its_limits_is_the_result():
+    # Trial 0 began nearly full: its time is the shortest, and no merit of its theta.
+    trials = [done(0, 9.0, -0.5), done(1, 1.0, -0.5), done(2, 2.0, -0.02), done(3, 3.0, 0.5), failed(4)]
+    assert decided(trials, 0, newest=True) == (2, Reason.NEWEST)
+    assert decided(trials, 3, newest=True) == (2, Reason.NEWEST)
+    assert decided(trials[:3], 2, newest=True) == (2, Reason.BELIEVED)
+    assert decided([done(0, 9.0, 0.5), done(1, 1.0, 0.2)], 1, newest=True) == (1, Reason.CLOSEST)
+    assert decided(trials, 2) == (0, Reason.MEASURED)
+
+
 @dataclass(frozen=True)
 class Believes(Halfway):
     """Believes best the trial of this place among those it is shown, earlier studies' first; counts how often it is asked."""

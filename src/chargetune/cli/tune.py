@@ -32,7 +32,7 @@ from chargetune.runtime.counted import counted
 from chargetune.runtime.notes import first_line
 from chargetune.study.executors import process_executor
 from chargetune.study.files import write_whole
-from chargetune.study.result import StudyResult, read_result
+from chargetune.study.result import StudyResult, by_newest, read_result
 from chargetune.study.store.store import Store
 from chargetune.study.study import Study
 from chargetune.study.trial import Trial, TrialStatus
@@ -165,11 +165,14 @@ def _run(
         if done and not quiet:
             progress.console.print(f"resumed: {counted(done, 'trial')} in {shown(kept)}", markup=False, soft_wrap=True)
 
-        def note(_: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
-            best = ""
-            if incumbent is not None and incumbent.score is not None:
-                best = f"{_headline(config, problem, incumbent.score)} (trial {incumbent.number})"
-            progress.update(task, advance=1, note=progress_note(best, violating, failures))
+        # Charges from starts of their own do not compare: the newest is shown, not the one that began fullest.
+        own = by_newest(study.record.identity)
+
+        def note(told: Trial, incumbent: Trial | None, violating: int, failures: int) -> None:
+            trial, said = told if own else incumbent, ""
+            if trial is not None and trial.score is not None:
+                said = f"{'last' if own else 'best'} {_headline(config, problem, trial.score)} (trial {trial.number})"
+            progress.update(task, advance=1, note=progress_note(said, violating, failures))
 
         stack.enter_context(_said(progress.console))
         # A tuner has loaded this folder by now.
@@ -190,10 +193,9 @@ def _run(
     return everything, more, result, safety
 
 
-def progress_note(best: str, violating: int, failures: int) -> str:
+def progress_note(said: str, violating: int, failures: int) -> str:
     """What a bar says of the trials so far, in about 50 characters; failures only where there are some."""
-    said = f"best {best}" if best else "none within limits"
-    return f"{said}, {violating} over" + f", {failures} failed" * (failures > 0)
+    return f"{said or 'none within limits'}, {violating} over" + f", {failures} failed" * (failures > 0)
 
 
 def _headline(config: Config, problem: ChargingProblem, score: Score) -> str:
@@ -255,9 +257,10 @@ def _start_label(problem: ChargingProblem, trials: Sequence[Trial]) -> str:
     """What trial 0 is: a safe study does not begin with the untuned controller."""
     if not trials or np.array_equal(trials[0].theta, problem.space.default):
         return "untuned"
-    if problem.safety is None:
-        return "trial 0"
-    return "declared start" if problem.safe_start is not None else "cautious start"
+    if problem.safe_start is not None:
+        return "declared start"
+    # Over a range the first theta is chosen for all of it, and no cautious corner.
+    return "trial 0" if problem.safety is None or problem.range is not None else "cautious start"
 
 
 def _closing(problem: ChargingProblem, everything: list[Trial], result: StudyResult, tuner: str = "") -> None:

@@ -88,7 +88,10 @@ class StudyView:
         problem = self.problem
         if problem is None or problem.safety is None:
             return "first trial"
-        return "declared start" if problem.safe_start is not None else "cautious start"
+        if problem.safe_start is not None:
+            return "declared start"
+        # Over a range the first theta is chosen for all of it, and no cautious corner.
+        return "cautious start" if problem.range is None else "first trial"
 
     @cached_property
     def units(self) -> dict[str, str]:

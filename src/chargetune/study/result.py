@@ -14,7 +14,7 @@ from chargetune.study.store.rows import StudyRecord
 from chargetune.study.store.store import Store
 from chargetune.study.trial import Trial, TrialStatus, best_feasible, best_performance
 
-__all__ = ["Reason", "StudyResult", "allowed", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]
+__all__ = ["Reason", "StudyResult", "allowed", "by_newest", "by_performance", "made_from", "measured_result", "read_result", "with_belief"]
 
 
 class Reason(StrEnum):
@@ -25,6 +25,7 @@ class Reason(StrEnum):
     CLEAR = "clear"
     CLOSEST = "closest"
     PERFORMANCE = "performance"
+    NEWEST = "newest"
     NONE = "none"
 
 
@@ -34,6 +35,7 @@ SENTENCES = {
     Reason.CLEAR: "it kept every limit by more than the tolerance, and was measured better than the trial that the tuner believes best",
     Reason.CLOSEST: "no trial kept every limit, and it came closest, in tolerances",
     Reason.PERFORMANCE: "it has the best performance G, which weighs violations",
+    Reason.NEWEST: "it is the newest that kept every limit; objectives of trials from other conditions do not compare",
     Reason.NONE: "no trial has a score",
 }
 
@@ -69,11 +71,12 @@ class StudyResult:
         return {"trial": number, "reason": self.reason.value, "asked": self.asked, "sentence": self.sentence}
 
 
-def measured_result(trials: Sequence[Trial], *, by_performance: bool = False, asked: bool = True) -> StudyResult:
+def measured_result(trials: Sequence[Trial], *, by_performance: bool = False, newest: bool = False, asked: bool = True) -> StudyResult:
     """The result by what was measured alone.
 
     The largest objective of those that kept every limit; where none did the least `Score.worst`; with ``by_performance`` the
-    largest performance G. The earlier one of equals.
+    largest performance G. The earlier one of equals. ``newest``: each trial was under a condition of its own, so that a good objective is
+    no merit of its theta, and the newest one that kept every limit is the result.
     """
     scored = [t for t in trials if t.score is not None]
     if not scored:
@@ -81,21 +84,24 @@ def measured_result(trials: Sequence[Trial], *, by_performance: bool = False, as
         return StudyResult(None, Reason.NONE)
     if by_performance:
         return StudyResult(best_performance(scored), Reason.PERFORMANCE, asked)
-    best = best_feasible(scored)
+    best = max((t for t in scored if t.feasible), key=lambda t: t.number, default=None) if newest else best_feasible(scored)
     if best is not None:
-        return StudyResult(best, Reason.MEASURED, asked)
+        return StudyResult(best, Reason.NEWEST if newest else Reason.MEASURED, asked)
     closest = min(scored, key=lambda t: (t.score.worst if t.score else 0.0, t.number))
     return StudyResult(closest, Reason.CLOSEST, asked)
 
 
-def with_belief(trials: Sequence[Trial], best: Callable[[], Trial | None], *, by_performance: bool) -> StudyResult:
+def with_belief(trials: Sequence[Trial], best: Callable[[], Trial | None], *, by_performance: bool, newest: bool = False) -> StudyResult:
     """The result where the tuner is asked, too: ``best`` gives the trial that it believes best from all traces.
 
     A single noisy verdict does not decide; neither does a belief against what was measured beyond doubt. So it counts only for
     a trial that was measured to keep every limit, and not where another one has a better objective and kept every limit by more
-    than its tolerance, which is what noise and rounding explain: of that one there is nothing to believe.
+    than its tolerance, which is what noise and rounding explain: of that one there is nothing to believe. With ``newest`` objectives do
+    not compare (`measured_result`), and a belief in the newest one stands.
     """
-    measured = measured_result(trials, by_performance=by_performance)
+    measured = measured_result(trials, by_performance=by_performance, newest=newest)
+    if measured.reason is Reason.NEWEST:
+        return StudyResult(measured.trial, Reason.BELIEVED) if best() == measured.trial else measured
     if measured.reason is not Reason.MEASURED:
         return measured
     believed = best()
@@ -124,7 +130,8 @@ def _read(store: Store, record: StudyRecord, trials: Sequence[Trial]) -> StudyRe
         trial = next((t for t in trials if t.number == stored.number), None)
         if (trial is None) == (stored.number is None) and stored.reason in set(Reason):
             return StudyResult(trial, Reason(stored.reason))
-    return measured_result(allowed(record, trials), by_performance=by_performance(record.identity), asked=False)
+    own, newest = by_performance(record.identity), by_newest(record.identity)
+    return measured_result(allowed(record, trials), by_performance=own, newest=newest, asked=False)
 
 
 def allowed(record: StudyRecord, trials: Sequence[Trial]) -> list[Trial]:
@@ -149,3 +156,9 @@ def by_performance(identity: Mapping[str, Any]) -> bool:
     named = config.get("study") if isinstance(config, Mapping) else None
     name = named.get("tuner") if isinstance(named, Mapping) else None
     return name == "ei" or (isinstance(tuner, Mapping) and tuner.get("type") == "ExpectedImprovement")
+
+
+def by_newest(identity: Mapping[str, Any]) -> bool:
+    """Whether each trial of a study is under a condition of its own: a twin that learns one plant of a range of use."""
+    tuner = identity.get("tuner")
+    return isinstance(tuner, Mapping) and tuner.get("type") == "RangeTwinTuner"

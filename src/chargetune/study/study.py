@@ -27,7 +27,7 @@ from chargetune.study.executors import bounded_workers, process_executor
 from chargetune.study.identity import StudyError, check_change, study_identity
 from chargetune.study.progress import Progress, Tally, progress_bar
 from chargetune.study.provenance import utc_now, versions
-from chargetune.study.result import StudyResult, allowed, by_performance, made_from, read_result, with_belief
+from chargetune.study.result import StudyResult, allowed, by_newest, by_performance, made_from, read_result, with_belief
 from chargetune.study.runner import Losses, WorkerError, check_crosses, lost, outcomes
 from chargetune.study.schedule import Schedule
 from chargetune.study.serialization import canonical_json, score_to_json, sha256
@@ -162,9 +162,9 @@ class Study:
         known = read_result(self.store, self.record, trials)
         if known.asked:
             return known
-        own = by_performance(self.record.identity)
+        own, newest = by_performance(self.record.identity), by_newest(self.record.identity)
         count = allowed(self.record, trials)
-        found = with_belief(count, lambda: self._believed_best(count), by_performance=own)
+        found = with_belief(count, lambda: self._believed_best(count), by_performance=own, newest=newest)
         number = None if found.trial is None else found.trial.number
         made = ResultRecord(number, found.reason.value, made_from(self.record, trials))
         self.store.set_result(self.record.id, made, term=self.term)
