@@ -99,7 +99,7 @@ def metrics_table(scores: Mapping[str, Score | None], problem: ChargingProblem, 
     if any(s and "plants" in s.metrics for s in runs):
         counts = map(plants_over, runs)
         row("drawn plants over a limit", counts, "")
-        table.add_row("  above: their means, of limits the worst")
+        table.add_row("  above: means; of limits the worst")
     row("limits", (("kept" if s.feasible else "[red]broken[/]") if s else "-" for s in runs), "")
     return table
 
