@@ -10,6 +10,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chargetune.runtime.counted import counted
+
 __all__ = ["Choice", "Distribution", "LogNormal", "Normal", "StudentT", "Uniform", "Variation"]
 
 # What rounding may take below 0 of an eigenvalue of a correlation, or off 1 of its diagonal.
@@ -209,7 +211,9 @@ class Variation:
             matrix = np.asarray(self.correlation, dtype=np.float64)
         numbers = sum(blocks[name] for name in self.parameters)
         if len(matrix) != numbers:
-            raise ValueError(f"variation {self.name}: correlation has {len(matrix)} rows, allowed is one for each of {numbers} numbers")
+            raise ValueError(
+                f"variation {self.name}: correlation has {counted(len(matrix), 'row')}, allowed is one for each of {numbers} numbers"
+            )
         values, vectors = np.linalg.eigh(matrix)
         return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 

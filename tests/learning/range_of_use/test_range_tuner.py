@@ -107,14 +107,14 @@ def test_a_violation_that_does_not_change_with_theta_is_left_behind():
 @pytest.mark.parametrize("corners", [0, 8])
 def test_beside_a_plant_that_no_theta_mends_all_others_keep_the_limit(corners):
     """A plant that begins half beyond the limit stays there whatever theta is; the best power is that of the others."""
-    rare = ct.Variation("hot", ct.Choice((0.0,) * 31 + (1.5,)), starts={"T": 1.0}, of="episode")
+    rare = ct.Variation("hot", ct.Choice((0.0,) * 7 + (1.5,)), starts={"T": 1.0}, of="episode")
     use = ct.RangeOfUse(ct.SimulatedPlant(heater(1.0), {}), (*RANGE.variations, rare))
     evaluation = ct.RangeEvaluation(loop(range_of_use=use), 40)
-    tuner = ct.RangeTuner(evaluation, seed=0, settings=ct.RangeSettings(corners=corners))
+    tuner = ct.RangeTuner(evaluation, seed=0, settings=ct.RangeSettings(plants=16, pool=4, corners=corners))
     drawn = use.draw(tuner.settings.plants, 0)
-    assert 0 < sum(one.values["hot"][0] > 0 for one in drawn) < 6
+    assert 0 < sum(one.values["hot"][0] > 0 for one in drawn) < 4
     best = LIMIT / (1.25 * (1 - 0.8**STEPS))
-    assert tuner.ask(SPACE, [])[0][0] == pytest.approx(best, rel=0.01)
+    assert tuner.ask(SPACE, [])[0][0] == pytest.approx(best, rel=0.03)
 
 
 def test_a_trial_is_judged_on_draws_that_nothing_was_chosen_on():
@@ -153,16 +153,19 @@ def test_a_theta_for_the_slowest_plant_is_another_one_than_for_the_mean():
     kinds = [ct.SimulatedPlant(mirrored.with_parameters(rising=r, falling=f), {}) for r, f in [(1.0, 0.0)] * 4 + [(0.0, 1.0)]]
     use = ct.OwnDraws(kinds[0], lambda rng: kinds[rng.integers(5)])
     wide = ct.SimulatedRange(BLIND, use, STEPS, (ct.ScoredLimit("T", upper=9.0, tolerance=TOLERANCE),), heat)
-    found = {q: ct.RangeTuner(ct.RangeEvaluation(wide, 20, objective_quantile=q), seed=0).ask(SPACE, [])[0][0] for q in (None, 1.0)}
+    few, found = ct.RangeSettings(plants=12, pool=4, corners=0), {}
+    for q in (None, 1.0):
+        found[q] = ct.RangeTuner(ct.RangeEvaluation(wide, 20, objective_quantile=q), seed=0, settings=few).ask(SPACE, [])[0][0]
     assert found[None] == pytest.approx(2.0, abs=1e-3)
     assert found[1.0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_it_is_a_pure_function_of_its_trials():
     evaluation = ct.RangeEvaluation(loop(), 20)
-    trials = told(evaluation, ct.RangeTuner(evaluation, seed=1), 2)
-    again, other = ct.RangeTuner(evaluation, seed=1), ct.RangeTuner(evaluation, seed=2)
-    np.testing.assert_array_equal(again.ask(SPACE, trials), ct.RangeTuner(evaluation, seed=1).ask(SPACE, trials))
+    few = ct.RangeSettings(plants=12, pool=4, corners=4)
+    trials = told(evaluation, ct.RangeTuner(evaluation, 1, few), 2)
+    again, other = ct.RangeTuner(evaluation, 1, few), ct.RangeTuner(evaluation, 2, few)
+    np.testing.assert_array_equal(again.ask(SPACE, trials), ct.RangeTuner(evaluation, 1, few).ask(SPACE, trials))
     assert again.ask(SPACE, trials, 2).shape == (2, 1)
     assert not np.array_equal(again.ask(SPACE, []), other.ask(SPACE, []))
 

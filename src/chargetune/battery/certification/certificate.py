@@ -28,6 +28,7 @@ from chargetune.battery.charging.range_settings import MEANING, NOT_ELECTROCHEMI
 from chargetune.episode.episode import Ending, Episode
 from chargetune.episode.score import Score
 from chargetune.plants.range_of_use import DrawnPlant
+from chargetune.runtime.counted import counted
 from chargetune.study.files import write_whole
 from chargetune.study.provenance import utc_now, versions
 
@@ -192,9 +193,9 @@ def drawn_text(problem: ChargingProblem) -> str:
     if problem.range is not None and problem.range.node_correlation:
         parts.append("Only those of the nodes of one table are correlated.")
     if problem.range_cells:
-        names = ", ".join(one.name for one in problem.range_cells)
+        names, cells = ", ".join(one.name for one in problem.range_cells), counted(len(problem.range_cells), "cell")
         parts.append(
-            f"Before that, R, C and capacity are drawn as another cell of the make of {len(problem.range_cells)} cells: {names}; "
+            f"Before that, R, C and capacity are drawn as another cell of the make of {cells}: {names}; "
             "predictive distribution of their logarithms, Student's t."
         )
     cell = problem.range.cell if problem.range else None

@@ -9,6 +9,7 @@ import numpy as np
 
 from chargetune.battery.cell.cell import Cell
 from chargetune.plants.variation import StudentT, Variation
+from chargetune.runtime.counted import counted
 
 __all__ = ["CELLS_MIN", "check_population", "population"]
 
@@ -59,10 +60,10 @@ def population(cell: Cell, cells: Sequence[Cell]) -> tuple[Cell, Variation]:
 def check_population(cell: Cell, cells: Sequence[Cell], where: str) -> None:
     """Raises ValueError where these cells have another circuit than ``cell``, or are too few."""
     if len(cells) < CELLS_MIN:
-        raise ValueError(f"range: cells = {where!r} has {len(cells)} cell files, allowed are at least {CELLS_MIN}")
+        raise ValueError(f"range: cells = {where!r} has {counted(len(cells), 'cell file')}, allowed are at least {CELLS_MIN}")
     for one in cells:
         if one.pairs != cell.pairs:
-            found = f"range: cells = {where!r}: {one.name!r} has {len(one.pairs)} R-C pairs"
+            found = f"range: cells = {where!r}: {one.name!r} has {counted(len(one.pairs), 'R-C pair')}"
             raise ValueError(f"{found}, allowed are {len(cell.pairs)}, as the study's cell has")
 
 
