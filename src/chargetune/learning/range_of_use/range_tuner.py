@@ -127,18 +127,20 @@ class RangeTuner:
         return search, u
 
     def _mended(self, search: _RangeSearch, u: NDArray[np.float64]) -> tuple[_RangeSearch, NDArray[np.float64]]:
-        """Where a search ended beyond a tolerance on a drawn plant: the same from the best of a few points on all plants.
+        """Where a search ended beyond a tolerance on many drawn plants: the same from the best of a few points on all plants.
 
         Where the input is saturated a violation has no slope, and beside one that is not mended all others are let grow as large. If that
-        mends it not, what each plant has left at its best point is left behind, where so fewer plants are beyond a tolerance.
+        mends it not, what each plant has left at its best point is left behind, where so fewer plants are beyond a tolerance. As many
+        plants as a trial adds are mended by the next search.
         """
-        if not search.broken(u):
+        few = self.settings.added
+        if search.broken(u) <= few:
             return search, u
         points = [u, np.zeros(u.size), np.ones(u.size), *sobol_points(u.size, self.seed, 0, self.settings.pool)]
         begin = min(points, key=search.merit_of_all)
         if begin is not u:
             points[0] = u = min(u, search.refine(begin), key=search.merit_of_all)
-        if not search.broken(u):
+        if search.broken(u) <= few:
             return search, u
         relaxed = search.leaving_behind(points)
         found = relaxed.refine(min(points, key=relaxed.merit_of_all))
