@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from chargetune.battery.plants.electrochemical import ElectrochemicalPlant
 from chargetune.model.model import Signal
 from chargetune.plants.plant import Plant
 from chargetune.plants.simulated import SimulatedPlant
+from chargetune.runtime.numpy_call import numpy_call
 
 __all__ = ["SteppablePlant", "as_steppable"]
 
@@ -54,11 +57,17 @@ class _Circuit:
         return self.plant.start_state
 
     def ahead(self, state: Any, current_A: float) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
+        first, last, following = numpy_call(self._interval, state, current_A)
+        return first.ravel(), last.ravel(), following.ravel()
+
+    @cached_property
+    def _interval(self) -> ca.Function:
+        """(state, current) -> (outputs at the start, at the end, state at the end): one call, as a search makes thousands."""
         model = self.plant.model
-        p = model.nominal
-        following = np.array(model.f(state, current_A, p)).ravel()
-        first, last = (np.array(model.h(x, current_A, p)).ravel() for x in (state, following))
-        return first, last, following
+        x, u, p = ca.SX.sym("x", len(self.start)), ca.SX.sym("u"), model.nominal
+        following = model.f(x, u, p)
+        results = (model.h(x, u, p), model.h(following, u, p), following)
+        return ca.Function("interval", [x, u], [ca.densify(one) for one in results])
 
 
 def as_steppable(plant: Plant) -> SteppablePlant | None:
