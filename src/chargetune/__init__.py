@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from chargetune.plants.sensors import Sensors
     from chargetune.plants.simulated import SimulatedPlant
     from chargetune.plants.variation import Choice, LogNormal, Normal, StudentT, Uniform, Variation
+    from chargetune.study.recompute import recompute
     from chargetune.study.store.store import Store
     from chargetune.study.study import Study
     from chargetune.study.warm_start import Earlier
@@ -111,6 +112,7 @@ __all__ = [
     "identify",
     "load_config",
     "open_study",
+    "recompute",
     "recorded_episode",
     "rk4",
     "run_episode",
@@ -178,6 +180,7 @@ _MODULES = {
     "identify": "battery.identification.pulse_fit",
     "load_config": "battery.studies.study_file",
     "open_study": "battery.studies.open_study",
+    "recompute": "study.recompute",
     "rk4": "model.integrators",
     "recorded_episode": "episode.recorded",
     "run_episode": "episode.stepwise",

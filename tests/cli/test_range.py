@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+import sqlite3
 
 import pytest
 from commands import chargetune
@@ -159,3 +161,36 @@ def test_compare_refuses_what_has_no_meaning_over_a_range(folder, tmp_path, refu
     plain = tmp_path / "s.toml"
     plain.write_text(study_text())
     assert "--draws 3: allowed only for a study with a table [range]" in refused("compare", plain, "--draws", 3)
+
+
+def test_verify_evaluates_each_drawn_plant_again(folder, tmp_path, chargetune_here):
+    assert "2 trials evaluated again: every figure is what theta and seed give" in chargetune("verify", folder / "use.sqlite").stdout
+    told = json.loads(chargetune("verify", folder / "use.sqlite", "--study", "use", "--trial", 1, "--json").stdout)
+    assert told["verified"] is True
+    # Somebody counts a plant less.
+    path = tmp_path / "other.sqlite"
+    shutil.copy(folder / "use.sqlite", path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("update trial set score = replace(score, '\"plants\":12.0', '\"plants\":11.0') where number = 0")
+    code, said, _ = chargetune_here("verify", path)
+    assert code == 1
+    assert "study 'use', trial 0: metrics.plants: stated 11.0, recomputed 12.0" in said
+    assert "1 figure not as stated" in said
+    assert "0 studies of" in chargetune("verify", path, "--trial", 5, code=2).stderr
+    assert "allowed are use" in chargetune("verify", path, "--study", "other", code=2).stderr
+    assert "allowed are a certificate and a store" in chargetune("verify", folder / "use.toml", code=2).stderr
+
+
+def test_export_has_a_row_for_each_drawn_plant(folder, trials, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    chargetune("store", "export", folder / "use.sqlite", "--format", "csv", "--out", tmp_path)
+    names = {path.name for path in (tmp_path / "use").iterdir()}
+    assert {"trial-0000.bdf.csv", "trial-0000.median.bdf.csv", "trial-0000.best.bdf.csv", "trial-0000.plants.csv"} < names
+    plants = pandas.read_csv(tmp_path / "use" / "trial-0000.plants.csv")
+    assert len(plants) == 12
+    assert plants["objective"].mean() == pytest.approx(trials[0]["objective"], rel=1e-9)
+    assert plants["excess of voltage_max_V"].max() == pytest.approx(trials[0]["excess"]["voltage_max_V"], rel=1e-9)
+    assert plants["drawn soc_start"].between(*RANGE["soc_start"]).all()
+    # The worst plant's trace is the one of the trial.
+    voltage = {name: pandas.read_csv(tmp_path / "use" / f"trial-0000{name}.bdf.csv")["Voltage / V"].max() for name in ("", ".best")}
+    assert voltage[""] > voltage[".best"]

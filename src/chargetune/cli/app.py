@@ -434,13 +434,25 @@ def certify(
 
 @app.command()
 def verify(
-    certificate: Annotated[Path, typer.Argument(help="Certificate (JSON); its traces lie beside it.", show_default=False)],
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Certificate (JSON), its traces lie beside it; or a store: a file, or postgresql://user@host/database.",
+            show_default=False,
+        ),
+    ],
+    study: Annotated[str | None, typer.Option(help="Of a store this study; otherwise all.", show_default=False)] = None,
+    trial: Annotated[int | None, typer.Option(help="Of a study this trial; otherwise all.", min=0, show_default=False)] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recompute every figure of a certificate from its traces; exit code 1 and the names when some differ."""
+    """Recompute what a file says; exit code 1 and the names when some figures differ.
+
+    Of a certificate: every figure from its traces. Of a store: every trial from its theta and seed; over a range each drawn plant.
+    """
     from chargetune.cli.verify import verify_command
 
-    verify_command(certificate, as_json=as_json)
+    verify_command(what, study=study, trial=trial, as_json=as_json)
 
 
 @store_app.command("check")

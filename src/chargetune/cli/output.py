@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from chargetune.battery.charging.problem import ChargingProblem
@@ -27,6 +29,7 @@ __all__ = [
     "result_line",
     "setting",
     "shown",
+    "steps",
     "theta_lines",
     "workers_for",
 ]
@@ -133,3 +136,12 @@ def theta_lines(names: Sequence[str], units: Sequence[str], theta: Sequence[floa
     return "\n".join(
         f"  {name} = {value:.5g} {'' if unit == '1' else unit}".rstrip() for name, unit, value in zip(names, units, theta, strict=True)
     )
+
+
+@contextmanager
+def steps(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar on stderr, gone at the end: call what it gives with how many of how many are done."""
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*parts, console=console(stderr=True), disable=quiet, transient=True) as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from chargetune.battery.studies.bdf_export import Format, export, planned_files
-from chargetune.cli.output import console, shown
+from chargetune.cli.output import console, shown, steps
 from chargetune.cli.outputs import Kind, Output, claim
 from chargetune.runtime.counted import counted
 from chargetune.study.store.damaged_reader import Damage
@@ -27,7 +24,7 @@ SHOWN = 20
 
 def check_command(location: str, *, as_json: bool) -> None:
     """Read everything in a store; exit code 1 when something is not as it was stored."""
-    with _steps("traces", quiet=as_json) as step:
+    with steps("traces", quiet=as_json) as step:
         verdict = check_store(location, step)
     counts = {"studies": verdict.studies, "trials": verdict.trials, "traces": verdict.traces}
     if as_json:
@@ -46,7 +43,7 @@ def salvage_command(location: str, target: str, *, as_json: bool) -> None:
     if "://" not in target:
         # That a store is there is refused where its studies are known.
         claim([Output("NEW", Path(target), Kind.STORE, renewed=True)], inputs=[location], overwrite=False, folders=False)
-    with _steps("traces", quiet=as_json) as step:
+    with steps("traces", quiet=as_json) as step:
         saved = salvage(location, target, step)
     counts = {"studies": saved.studies, "trials": saved.trials, "traces": saved.traces}
     if as_json:
@@ -64,7 +61,7 @@ def export_command(location: str, *, out: Path, study: str | None, form: Format,
         planned = planned_files(store, out, study=study, form=form)
         claim([Output("--out", p, kinds[p.suffix]) for p in planned], inputs=[location], overwrite=overwrite)
         try:
-            with _steps("trials", quiet=as_json) as step:
+            with steps("trials", quiet=as_json) as step:
                 written = export(store, out, study=study, form=form, step=step)
         except ImportError as error:
             raise ValueError(str(error)) from error
@@ -101,11 +98,3 @@ def _lines(lines: list[str]) -> None:
         console().print(line, style="red", markup=False, soft_wrap=True)
     if len(lines) > SHOWN:
         console().print(f"and {len(lines) - SHOWN} more (--json names all)", style="red", markup=False)
-
-
-@contextmanager
-def _steps(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*parts, console=console(stderr=True), disable=quiet, transient=True) as progress:
-        task = progress.add_task(what, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -117,9 +117,10 @@ class Episode:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> Episode:
-        """The inverse of `arrays` and `meta`."""
+        """The inverse of `arrays` and `meta`; arrays of other names are left out."""
         names = ("input_names", "output_names", "input_units", "output_units", "estimate_names")
-        values: dict[str, Any] = {**arrays, **{name: tuple(meta[name]) for name in names}}
+        values: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name in arrays}
+        values |= {name: tuple(meta[name]) for name in names}
         return cls(sampling_time_s=float(meta["sampling_time_s"]), ending=Ending(meta["ending"]), message=str(meta["message"]), **values)
 
     def _repr_html_(self) -> str:

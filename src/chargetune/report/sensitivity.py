@@ -15,7 +15,17 @@ from chargetune.report.study_view import StudyView
 from chargetune.study.evaluation import Evaluate
 from chargetune.study.trial import Trial
 
-__all__ = ["STEP", "Importance", "Sensitivity", "again", "finite_differences", "importance", "rank_correlations", "with_observer"]
+__all__ = [
+    "STEP",
+    "Importance",
+    "Sensitivity",
+    "again",
+    "evaluation_in",
+    "finite_differences",
+    "importance",
+    "rank_correlations",
+    "with_observer",
+]
 
 # Share of an entry's range (logarithmic for a log scale) by which it is moved.
 STEP = 0.02
@@ -54,7 +64,7 @@ def importance(view: StudyView, trial: Trial, progress: Callable[[], None] = lam
 
     Raises ValueError for a study that is not one of battery charging.
     """
-    evaluate, space, theta = _evaluation(view), view.space, np.array(trial.theta)
+    evaluate, space, theta = evaluation_in(view), view.space, np.array(trial.theta)
     base, _, _ = evaluate(theta, trial.seed)
     parts = [(f"{name}[all]", part) for name, part in space.slices.items() if part.stop - part.start > 1]
     parts += [(entry, slice(i, i + 1)) for i, entry in enumerate(space.entries)]
@@ -78,7 +88,7 @@ def again(view: StudyView, trial: Trial) -> float | None:
     Compared are objective and excesses. A difference above rounding says that the program or the machine is another.
     Raises ValueError for a study that is not one of battery charging.
     """
-    score, _, _ = _evaluation(view)(np.array(trial.theta), trial.seed)
+    score, _, _ = evaluation_in(view)(np.array(trial.theta), trial.seed)
     if score is None or trial.score is None:
         return None
     pairs = [(score.objective, trial.score.objective), *((score.excess[n], e) for n, e in trial.score.excess.items())]
@@ -90,7 +100,7 @@ def finite_differences(view: StudyView, trial: Trial, progress: Callable[[], Non
 
     Raises ValueError for a study that is not one of battery charging: its document does not say how to evaluate.
     """
-    evaluate, space = _evaluation(view), view.space
+    evaluate, space = evaluation_in(view), view.space
     base, _, _ = evaluate(np.array(trial.theta), trial.seed)
     centre, out = space.to_unit(np.array(trial.theta)), []
     for i, entry in enumerate(space.entries):
@@ -125,8 +135,8 @@ def with_observer(view: StudyView, trial: Trial) -> Score | None:
     return evaluate(np.zeros(0), trial.seed)[0]
 
 
-def _evaluation(view: StudyView) -> Evaluate:
-    """What a trial of the study was: one charge, or a theta on drawn plants."""
+def evaluation_in(view: StudyView) -> Evaluate:
+    """What a trial of the study was: one charge, or a theta on drawn plants. Raises ValueError where its document does not say."""
     if view.problem is None:
         raise ValueError(f"study {view.name!r} is not one of battery charging, it cannot be evaluated from its document")
     # Of the others only "twin" has charges in conditions of their own, where the study has a range of use.

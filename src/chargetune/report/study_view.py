@@ -12,6 +12,7 @@ import numpy as np
 from chargetune.battery.charging.problem import ChargingProblem, judged_exactly
 from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.episode.episode import Episode
+from chargetune.learning.range_of_use.range_trace import RangeTrace
 from chargetune.model.parameter_space import ParameterSpace
 from chargetune.study.result import StudyResult, read_result
 from chargetune.study.serialization import space_from_json
@@ -153,6 +154,17 @@ class StudyView:
                 except (KeyError, TypeError, ValueError) as error:
                     # A program may store arrays of its own with a trial.
                     yield ReadStudy(trial, None, f"the stored trace is not that of an episode ({error})")
+
+    def range_trace(self, trial: Trial | None) -> RangeTrace | None:
+        """All that the trace of a trial over a range of use holds; None for any other trial, and where an older version stored it.
+
+        Raises StoreError for a trace that is not as it was stored.
+        """
+        if trial is None or not self.over_range:
+            return None
+        with Store(self.location, read_only=True) as store:
+            trace = store.trace(store.study(self.name).id, trial.number)
+        return None if trace is None else RangeTrace.from_arrays(*trace)
 
     def episode(self, trial: Trial | None) -> Episode | None:
         """The episode of one trial; None without trial or trace."""

@@ -128,7 +128,7 @@ def test_a_trial_is_judged_on_draws_that_nothing_was_chosen_on():
 
 def test_the_score_is_that_of_all_plants_counted_by_hand():
     evaluation, theta = ct.RangeEvaluation(loop(), 50), np.array([0.9])
-    score, worst, why = evaluation(theta, 7)
+    score, trace, why = evaluation(theta, 7)
     gains = np.array([1 + one.values["gain"][0] for one in RANGE.draw(50, 7)])
     levels = gains[:, None] * 0.9 * (1 - 0.8 ** np.arange(1, STEPS + 1))
     assert why == "done"
@@ -136,7 +136,13 @@ def test_the_score_is_that_of_all_plants_counted_by_hand():
     assert score.excess["T"] == pytest.approx(levels.max() - LIMIT, rel=1e-5)
     assert score.metrics["violating_plants"] == np.sum(levels.max(axis=1) - LIMIT > TOLERANCE)
     assert score.metrics["objective_worst"] == pytest.approx(levels.mean(axis=1).min(), rel=1e-5)
-    np.testing.assert_allclose(worst.signal("T")[1], levels[np.argmax(levels.max(axis=1))], rtol=1e-5)
+    order = np.argsort(levels.max(axis=1))
+    for name, place in (("worst", order[-1]), ("median", order[24]), ("best", order[0])):
+        assert trace.places[name] == place
+        np.testing.assert_allclose(getattr(trace, name).signal("T")[1], levels[place], rtol=1e-5)
+    np.testing.assert_allclose(trace.plants["objective"], levels.mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(trace.plants["excess of T"], levels.max(axis=1) - LIMIT, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(1 + trace.plants["drawn gain"], gains)
     for quantile, share in ((1.0, 0.0), (0.9, 0.1), (0.0, 1.0)):
         least, _, _ = ct.RangeEvaluation(loop(), 50, objective_quantile=quantile)(theta, 7)
         assert least.objective == pytest.approx(np.quantile(levels.mean(axis=1), share), rel=1e-5)
@@ -180,9 +186,13 @@ def test_a_failed_plant_fails_the_trial_and_says_how_many():
         model, SPACE, horizon=1, stage_cost=lambda s: (s.u["u"] - s.theta["power"]) ** 2, input_lower={"u": 0.0}, input_upper={"u": 2.0}
     )
     signs = ct.RangeOfUse(ct.SimulatedPlant(model, {}), (ct.Variation("sign", ct.Choice((0.0, -2.0)), parameters={"gain": 1.0}),))
-    score, _, why = ct.RangeEvaluation(loop(controller=controller, range_of_use=signs), 16)(np.array([1.0]), 0)
+    score, trace, why = ct.RangeEvaluation(loop(controller=controller, range_of_use=signs), 16)(np.array([1.0]), 0)
     assert score is None
     assert why.startswith("8 of 16 plants")
+    # What the others did is kept, and which failed.
+    assert np.isnan(trace.plants["objective"]).sum() == 8
+    np.testing.assert_array_equal(np.isnan(trace.plants["objective"]), trace.plants["drawn sign"] == -2.0)
+    assert np.isfinite(trace.plants["objective"][list(trace.places.values())]).all()
 
 
 def test_run_plants_is_the_same_in_batches_as_one_by_one():

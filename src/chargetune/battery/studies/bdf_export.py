@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
+from chargetune.learning.range_of_use.range_trace import RangeTrace
 from chargetune.study.dataframe import trials_dataframe
 from chargetune.study.files import write_whole
 from chargetune.study.result import read_result
@@ -26,6 +27,8 @@ from chargetune.study.trial import Trial
 __all__ = ["Exported", "Format", "bdf_columns", "export", "planned_files"]
 
 Format = Literal["parquet", "csv"]
+# What follows the name of a trial in those of its files.
+ENDINGS = (".bdf", ".median.bdf", ".best.bdf", ".plants")
 # Signal of this library -> BDF's name and what is added for its unit.
 BDF = {"current_A": ("Current / A", 0.0), "voltage_V": ("Voltage / V", 0.0), "temperature_K": ("Surface Temperature / degC", -273.15)}
 
@@ -72,8 +75,10 @@ def export(
 ) -> Exported:
     """Write each study, or the one named, into a folder of its own below ``folder``.
 
-    ``study.json``: identity, versions and result; ``trials.parquet``: one row a trial; ``trial-0007.bdf.parquet``: its trace. The trials
-    of earlier studies (D_0) are among them with numbers below 0, as ``earlier-0003``. Existing files of these names are replaced.
+    ``study.json``: identity, versions and result; ``trials.parquet``: one row a trial; ``trial-0007.bdf.parquet``: its trace. Of a trial
+    over a range of use the trace is that of the worst plant; ``trial-0007.median.bdf.parquet`` and ``.best.bdf.parquet`` are those of two
+    more, ``trial-0007.plants.parquet`` has one row a drawn plant (`RangeTrace`). The trials of earlier studies (D_0) are among them with
+    numbers below 0, as ``earlier-0003``. Existing files of these names are replaced.
 
     Raises ImportError without pandas (and pyarrow), StoreError for a study that is not there.
     """
@@ -93,12 +98,11 @@ def export(
         files.append(_write(frame.reset_index(), place / "trials", form))
         for trial in trials:
             try:
-                table = _trace(store, record, trial)
+                tables = _traces(store, record, trial)
             except (StoreError, ValueError) as error:
                 left.append(f"study {record.name!r}, trial {trial.number}: {error}")
             else:
-                if table is not None:
-                    files.append(_write(table, place / _trace_name(trial), form))
+                files += [_write(table, place / f"{_trial_name(trial)}{ending}", form) for ending, table in tables.items()]
             done += 1
             if step is not None:
                 step(done, total)
@@ -106,13 +110,14 @@ def export(
 
 
 def planned_files(store: Store, folder: str | os.PathLike[str], *, study: str | None = None, form: Format = "parquet") -> list[Path]:
-    """The files that `export` writes, but for those of traces that turn out to be damaged."""
+    """The files that `export` may write: a trace says itself whether it is one of a range of use, and it may be damaged."""
     records, work = _work(store, study)
     files: list[Path] = []
     for record, trials in work:
         place = Path(folder) / _folder_name(record, records)
         files += [place / "study.json", place / f"trials.{form}"]
-        files += [place / f"{_trace_name(trial)}.{form}" for trial in trials if trial.trace_sha256 is not None]
+        traced = [_trial_name(trial) for trial in trials if trial.trace_sha256 is not None]
+        files += [place / f"{name}{ending}.{form}" for name in traced for ending in ENDINGS]
     return files
 
 
@@ -121,8 +126,8 @@ def _work(store: Store, study: str | None) -> tuple[list[StudyRecord], list[tupl
     return records, [(record, [*store.earlier(record.id), *store.trials(record.id)]) for record in records]
 
 
-def _trace_name(trial: Trial) -> str:
-    return f"trial-{trial.number:04d}.bdf" if trial.number >= 0 else f"earlier-{-trial.number:04d}.bdf"
+def _trial_name(trial: Trial) -> str:
+    return f"trial-{trial.number:04d}" if trial.number >= 0 else f"earlier-{-trial.number:04d}"
 
 
 def _need(form: Format) -> None:
@@ -131,17 +136,20 @@ def _need(form: Format) -> None:
         raise ImportError(f"export as {form} needs {' and '.join(missing)}: pip install 'chargetune[export]'")
 
 
-def _trace(store: Store, record: StudyRecord, trial: Trial) -> Any:
+def _traces(store: Store, record: StudyRecord, trial: Trial) -> dict[str, Any]:
+    """The tables of one trial by `ENDINGS`."""
     import pandas as pd
 
     trace = store.trace(record.id, trial.number)
     if trace is None:
-        return None
+        return {}
     try:
-        episode = Episode.from_arrays(*trace)
+        spread = RangeTrace.from_arrays(*trace)
+        episodes = [Episode.from_arrays(*trace)] if spread is None else [spread.worst, spread.median, spread.best]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError("its trace is no episode of this library, but the caller's own; it is left out") from error
-    return pd.DataFrame(bdf_columns(episode))
+    tables = [bdf_columns(episode) for episode in episodes] + ([] if spread is None else [dict(spread.plants)])
+    return {ending: pd.DataFrame(table) for ending, table in zip(ENDINGS, tables, strict=False)}
 
 
 def _write(frame: Any, path: Path, form: Format) -> Path:

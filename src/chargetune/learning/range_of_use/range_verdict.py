@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from chargetune.episode.episode import Episode
 from chargetune.episode.score import Score
 from chargetune.learning.range_of_use.range_loop import RangeLoop
+from chargetune.learning.range_of_use.range_trace import RangeTrace
 from chargetune.plants.range_of_use import DrawnPlant
 from chargetune.runtime.counted import counted
 
@@ -61,8 +62,8 @@ class RangeEvaluation:
 
     So no draw that chose a theta judges it. The score's objective is that over the plants, its excesses are the worst of any plant;
     ``metrics`` hold how many plants broke a limit, of how many, and every figure of the plants as mean, or as largest
-    (`RangeLoop.largest_of`). The trace is that of the plant with the largest excess; all others follow from the seed. A plant whose
-    episode did not come to its end fails the trial.
+    (`RangeLoop.largest_of`). The trace holds the figures of every plant and three episodes (`RangeTrace`); the others follow from the
+    seed (`results`). A plant whose episode did not come to its end fails the trial.
 
     objective_quantile
         None: the objective is the mean over the plants. Else what so large a share of them has at least; of a charging time what this
@@ -82,17 +83,33 @@ class RangeEvaluation:
         """Every plant of the trial with this seed."""
         return run_plants(self.loop, theta, self.loop.draw(self.plants, seed))
 
-    def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, Episode | None, str]:
+    def __call__(self, theta: NDArray[np.float64], seed: int) -> tuple[Score | None, RangeTrace | None, str]:
         results = self.results(theta, seed)
-        failed = sum(one.score is None for one in results)
-        worst = max(results, key=lambda one: one.beyond)
+        trace, failed = self._trace(results), sum(one.score is None for one in results)
         if failed:
-            return (
-                None,
-                worst.episode,
-                f"{failed} of {counted(len(results), 'plant')}: the episode did not come to an end or have no verdict",
-            )
-        return self._score(results), worst.episode, "done"
+            return None, trace, f"{failed} of {counted(len(results), 'plant')}: the episode did not come to an end or have no verdict"
+        return self._score(results), trace, "done"
+
+    def _trace(self, results: Sequence[PlantResult]) -> RangeTrace | None:
+        """None where no plant's episode came to its end."""
+        ended = [(one.beyond, place, one.episode) for place, one in enumerate(results) if one.episode is not None]
+        if not ended:
+            return None
+        ended.sort(key=lambda one: one[:2])
+        three = {"worst": ended[-1], "median": ended[(len(ended) - 1) // 2], "best": ended[0]}
+        places = {name: place for name, (_, place, _) in three.items()}
+        return RangeTrace(**{name: episode for name, (_, _, episode) in three.items()}, places=places, plants=self._table(results))
+
+    def _table(self, results: Sequence[PlantResult]) -> dict[str, NDArray[np.float64]]:
+        rows: list[dict[str, float | None]] = []
+        for one in results:
+            row: dict[str, float | None] = {f"drawn {n}": v[0] for n, v in one.plant.values.items() if len(v) == 1}
+            if one.score is not None:
+                row |= {"objective": one.score.objective, **{f"excess of {n}": v for n, v in one.score.excess.items()}}
+                row |= one.score.metrics
+            rows.append(row)
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: np.array([np.nan if row.get(name) is None else row[name] for row in rows], dtype=float) for name in names}
 
     def _score(self, results: Sequence[PlantResult]) -> Score:
         scores = [one.score for one in results if one.score is not None]

@@ -110,6 +110,15 @@ def trajectories_figure(view: StudyView) -> Figure:
                 if signal in drawn:
                     axis.plot(*drawn[signal], color=color, linewidth=width, linestyle=dashes, label=text, zorder=3)
             handles.append(panels["soc"].lines[-1])
+        # A study that was written by an older version has the worst plant alone.
+        spread = view.range_trace(tuned)
+        for text, episode, dashes in (("median plant", spread.median, "--"), ("best plant", spread.best, ":")) if spread else ():
+            drawn = curves(episode)
+            for name, axis in panels.items():
+                signal = "voltage_V" if name == "near" else name
+                if signal in drawn:
+                    axis.plot(*drawn[signal], color=ORANGE, linewidth=0.7, linestyle=dashes, label=text, zorder=2.5)
+            handles.append(panels["soc"].lines[-1])
         if tuned is None:
             handles.append(words("tuned: none"))
         handles.append(_limits(panels, problem)[-1])

@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Sequence
 from html import escape
 
+import numpy as np
+
 from chargetune.episode.score import Score
 from chargetune.report.figures.convergence import loss
 from chargetune.report.limit_recheck import LimitCheck, recheck
@@ -148,7 +150,25 @@ def result(view: StudyView, feedback: Score | None = None) -> str:
         "untuned, offset_free: the controller with an observer that reads the voltage (estimator.kind), with its defaults and no theta, "
         f"run for this page with the seed of trial {best.number}. What it already does is no merit of learning."
     )
-    return section(what, beside(table(headings, rows), merit), paragraph(aside, "faint") if other else "")
+    return section(what, beside(table(headings, rows), merit), paragraph(aside, "faint") if other else "", _by_plant(view, best))
+
+
+def _by_plant(view: StudyView, best: Trial) -> str:
+    """The objective and each excess over the drawn plants of the result, the best plant first."""
+    trace = view.range_trace(best)
+    if trace is None:
+        return ""
+    told = objective_of_study(view)
+    columns = [(told.label, told.unit, -told.factor, "objective")]
+    columns += [(one.label, one.unit, one.factor, f"excess of {one.name}") for one in limits_of_study(view)]
+    rows: list[tuple[Cell, ...]] = []
+    for label, unit, factor, name in columns:
+        values = factor * trace.plants.get(name, np.zeros(0))
+        ended = values[np.isfinite(values)]
+        if len(ended):
+            rows.append((label, *(float(v) for v in np.quantile(ended, (0.0, 0.5, 0.95, 1.0))), (unit, "text")))
+    count = len(next(iter(trace.plants.values())))
+    return table((f"over {counted(count, 'drawn plant')}", "best", "median", "95 %", "worst", ("unit", "text")), rows)
 
 
 def limits(view: StudyView) -> str:
