@@ -28,9 +28,9 @@ def evaluate(theta, seed):
     return ct.score_limits(episode, LIMITS, objective=closeness)
 
 
-def tune(trials, seed, path):
+def tune(trials, seed, path, settings=None):
     """The trials of a study in this file, each with its noise-free swing beyond the limit, rad, and its objective, m s."""
-    tuner = ct.TwinTuner(TWIN, seed=seed, safety=ct.Safety(0.95))
+    tuner = ct.TwinTuner(TWIN, seed=seed, safety=ct.Safety(0.95), settings=settings or ct.TwinSettings())
     study = {"config": {"system": "crane, safe"}, "space": SPACE, "tuner": tuner, "seed": seed}
     with ct.Store(path) as store, ct.Study.create_or_resume(store, f"crane {seed}", **study) as tuning:
         tuning.run(evaluate, trials)

@@ -19,8 +19,8 @@ from study_text import study_text
 RANGE = {"soc_start": [0.3, 0.5], "resistance": 0.1, "growth": 0.2, "draws": 12}
 TABLES = {
     "study": {"name": "use", "tuner": "range", "trials": 2},
-    "controller": {"mismatch_seed": 1, "horizon": 3},
-    "episode": {"steps": 150, "soc_start": 0.4},
+    "controller": {"mismatch_seed": 1, "horizon": 3, "sampling_time_s": 20.0},
+    "episode": {"steps": 75, "soc_start": 0.4},
     "sensors": {"voltage_noise_sd_V": 0.0005},
     "theta.backoff": {"nodes": 2, "lower_V": 0.0, "upper_V": 0.2},
 }

@@ -14,7 +14,7 @@ from chargetune.battery.studies.study_file import problem_of_document
 from chargetune.episode.episode import Episode
 from chargetune.learning.range_of_use.range_trace import RangeTrace
 from chargetune.model.parameter_space import ParameterSpace
-from chargetune.study.result import StudyResult, read_result
+from chargetune.study.result import StudyResult, by_newest, read_result
 from chargetune.study.serialization import space_from_json
 from chargetune.study.store.store import Store, StoreError, StudyRecord
 from chargetune.study.trial import Trial, TrialStatus
@@ -56,6 +56,11 @@ class StudyView:
     def over_range(self) -> bool:
         """Whether a trial is a theta on drawn plants of a range of use, of which the trace is that of one."""
         return self.problem is not None and self.tuner == "range"
+
+    @property
+    def comparable(self) -> bool:
+        """Whether one trial's objective says that it is better than another: not where each is under a condition of its own."""
+        return self.record is None or not by_newest(self.record.identity)
 
     @property
     def judged(self) -> ChargingProblem | None:

@@ -143,7 +143,10 @@ class Study:
         return [t for t in self.trials() if t.status is TrialStatus.RUNNING]
 
     def best(self) -> Trial | None:
-        """The trial of the largest objective that was measured to keep every limit; the `result` may be another."""
+        """The trial of the largest objective that was measured to keep every limit; the `result` may be another.
+
+        Where each trial is under a condition of its own (`RangeTwinTuner`) it is the luckiest start, and only the `result` says anything.
+        """
         return best_feasible(allowed(self.record, self.trials()))
 
     def best_performance(self) -> Trial | None:

@@ -171,3 +171,15 @@ def test_tolerances_that_differ_have_no_common_line():
     score = replace(view.trials[0].score, tolerance={"speed": 0.1})
     figure = convergence_figure(replace(view, trials=(replace(view.trials[0], score=score), *view.trials[1:])))
     assert "tolerance" not in legend(figure)
+
+
+def test_where_each_trial_has_a_condition_of_its_own_none_is_the_best_so_far(stores):
+    """A charge that began fuller took less time, whatever theta was."""
+    mixed = read_study(stores["mixed"], "charge")
+    assert np.isfinite(incumbents(mixed)).any()
+    other = replace(mixed, record=replace(mixed.record, identity={**mixed.record.identity, "tuner": {"type": "RangeTwinTuner"}}))
+    assert not other.comparable
+    assert np.isnan(incumbents(other)).all()
+    assert not [line for line in convergence_figure(other).axes[0].lines if line.get_label() == "best so far"]
+    assert [line for line in convergence_figure(mixed).axes[0].lines if line.get_label() == "best so far"]
+    assert study_head(other)["objective"]["comparable"] is False

@@ -56,7 +56,12 @@ def worst_excess(view: StudyView, score: Score | None) -> float:
 
 
 def incumbents(view: StudyView) -> NDArray[np.float64]:
-    """The smallest loss up to each trial, among those within the limits (for "ei", whose G contains them, among all); NaN before."""
+    """The smallest loss up to each trial, among those within the limits (for "ei", whose G contains them, among all); NaN before.
+
+    All are NaN where trials are not comparable (`StudyView.comparable`): the one that began fullest would be the best.
+    """
+    if not view.comparable:
+        return np.full(len(view.trials), np.nan)
     counted = [t.score is not None and (view.tuner == "ei" or t.score.feasible) for t in view.trials]
     losses = [loss(view, t) if ok else np.nan for t, ok in zip(view.trials, counted, strict=True)]
     return np.asarray(np.fmin.accumulate(losses), dtype=float)

@@ -128,10 +128,10 @@ def _importance(view: StudyView, found: Sequence[Importance]) -> dict[str, Any] 
 
 
 def _courses(view: StudyView, others: Sequence[StudyView]) -> dict[str, Any] | None:
-    """The best so far over the trials, of the studies whose objective is this one's."""
+    """The best so far over the trials, of the studies whose objective is this one's and can be compared."""
     words = objective_of_study(view)
-    alike = [one for one in (view, *others) if objective_of_study(one).axis == words.axis]
-    if len(alike) < 2:
+    alike = [one for one in (view, *others) if one.comparable and objective_of_study(one).axis == words.axis]
+    if len(alike) < 2 or not view.comparable:
         return None
     lines = []
     for one in alike:

@@ -43,6 +43,7 @@ def study_head(view: StudyView) -> dict[str, Any]:
             "short": f"{words.short} ({words.unit})" if words.unit else words.short,
             "most": words.most,
             "larger": words.factor < 0,
+            "comparable": view.comparable,
             "possible": None if possible is None else _finite(words.factor * possible),
         },
         "excesses": [

@@ -125,6 +125,9 @@ const Figures = (() => {
   const unit = (text) => (text ? ` (${text})` : "");
   const decade = (values) => values.length > 0 && Math.min(...values) > 0 && Math.max(...values) > 10 * Math.min(...values);
 
+  // Where each trial is under a condition of its own none is the best so far.
+  const ofConvergence = ({ objective }) => (objective.comparable ? "each trial, and the best so far" : "each trial; each under a condition of its own");
+
   // Above what each trial was worth, below one panel a limit, in its own unit.
   function convergence(node, head, rows, marked = []) {
     const limits = head.excesses.filter(({ drawn }) => drawn), data = [], shapes = [], annotations = [];
@@ -161,7 +164,7 @@ const Figures = (() => {
         });
       }
     }
-    const courseOfBest = incumbents(rows, head.objective.larger);
+    const courseOfBest = head.objective.comparable ? incumbents(rows, head.objective.larger) : [];
     if (courseOfBest.some((value) => value !== null)) {
       data.push({
         x: rows.map((row) => row.number), y: courseOfBest, name: "best so far", mode: "lines", hoverinfo: "skip",
@@ -318,5 +321,5 @@ const Figures = (() => {
     }));
   }
 
-  return { overTime, overSoc, convergence, slice, parallel, losses, courses, bars, place, legend, incumbents };
+  return { overTime, overSoc, convergence, slice, parallel, losses, courses, bars, place, legend, incumbents, ofConvergence };
 })();

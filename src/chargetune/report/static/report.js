@@ -37,7 +37,7 @@
       add("profiles", label, false, (node) => Figures.overSoc(node, key, shown, others));
     }
     const marked = shown.map(({ label, colour, number }) => ({ label, colour, row: rows.find((row) => row.number === number) }));
-    add("convergence", "each trial, and the best so far", true, (node) => Figures.convergence(node, head, rows, marked));
+    add("convergence", Figures.ofConvergence(head), true, (node) => Figures.convergence(node, head, rows, marked));
     if (importance && where("importance")) {
       const more = [
         importance.left_out ? `; ${importance.left_out} smaller ones left out` : "",

@@ -108,7 +108,7 @@ async function drawOnce() {
   for (const [node, key] of learned) await Figures.overSoc(node, key, shown);
   const list = [...rows.values()].sort((a, b) => a.number - b.number);
   const marked = entries.filter(({ colour }) => colour !== "trials").map((entry) => ({ ...entry, row: rows.get(entry.number) }));
-  const all = place("convergence", "all", "each trial, and the best so far; a point can be chosen", true);
+  const all = place("convergence", "all", `${Figures.ofConvergence(head)}; a point can be chosen`, true);
   await Figures.convergence(all, head, list, marked);
   if (!all.dataset.listens) {
     all.dataset.listens = "yes";
