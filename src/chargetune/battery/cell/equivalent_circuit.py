@@ -10,10 +10,14 @@ import casadi as ca
 from chargetune.battery.cell.cell import Cell
 from chargetune.model.model import Model, Named, Signal
 from chargetune.model.splines import natural_spline, pchip
+from chargetune.runtime.cache import Built
 
 __all__ = ["ecm_model", "overpotentials", "start_state", "table_nodes"]
 
 FLOOR = 1e-3
+OF_THERMAL = ("heat_capacity_J_K", "cooling_W_K", "ambient_K", "reference_K", "activation_J_mol", "entropic_V_K")
+
+_CIRCUITS = Built(32)
 
 
 def table_nodes(soc: tuple[float, ...]) -> list[float]:
@@ -55,6 +59,18 @@ def ecm_model(
     ``settings`` are further run-time parameters for an estimator; of them f and h read resistance_factor alone, where it is
     given: a factor on all resistances. With ``last_current`` the current of the interval before is a state, last_current_A.
     """
+    parameters: dict[str, Any] = {name: getattr(cell, name) for name in (*cell.tables, "capacity_Ah", "coulombic_efficiency")}
+    if cell.thermal:
+        parameters |= {name: getattr(cell.thermal, name) for name in OF_THERMAL}
+    parameters |= settings or {}
+    factor = cell.thermal and (cell.thermal.factor_K, cell.thermal.factor)
+    # All that the equations have as numbers; the rest are parameters, and cells that differ in these alone share one pair of functions.
+    key = (cell.soc, tuple(cell.pairs), cell.ocv_soc, cell.ocv_V, factor, cell.anode, tuple(settings or ()), sampling_time_s, last_current)
+    circuit = _CIRCUITS.get(key, lambda: _circuit(cell, parameters, sampling_time_s, last_current=last_current))
+    return circuit.with_parameters(**parameters)
+
+
+def _circuit(cell: Cell, parameters: Mapping[str, Any], sampling_time_s: float, *, last_current: bool) -> Model:
     nodes = table_nodes(cell.soc)
     low, high = int(cell.soc[0] > 0.0), int(cell.soc[-1] < 1.0)
     thermal, anode, pairs = cell.thermal, cell.anode, dict(zip(cell.pairs, overpotentials(cell), strict=True))
@@ -94,11 +110,8 @@ def ecm_model(
         return following, outputs
 
     states = [Signal("soc"), *(Signal(name, "V") for name in pairs.values())]
-    of_thermal = ("heat_capacity_J_K", "cooling_W_K", "ambient_K", "reference_K", "activation_J_mol", "entropic_V_K")
-    parameters: dict[str, Any] = {name: getattr(cell, name) for name in (*cell.tables, "capacity_Ah", "coulombic_efficiency")}
     if thermal:
         states.append(Signal("temperature_K", "K"))
-        parameters |= {name: getattr(thermal, name) for name in of_thermal}
     outputs = list(states)
     if last_current:
         states.append(Signal("last_current_A", "A"))
@@ -107,7 +120,7 @@ def ecm_model(
         states=states,
         inputs=(Signal("current_A", "A"),),
         outputs=(Signal("voltage_V", "V"), *outputs, *([Signal("anode_potential_V", "V")] if anode else [])),
-        parameters=parameters | dict(settings or {}),
+        parameters=parameters,
         sampling_time_s=sampling_time_s,
         equations=equations,
     )
