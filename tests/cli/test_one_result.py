@@ -70,9 +70,9 @@ def shown(path, folder, *, kept=True):
     told["show, result"] = study["result"]["trial"]
     one = json.loads(chargetune("show", path, "--study", NAME, "--json").stdout)
     told["show one, result"] = one["result"]["trial"]
-    told["compare"] = json.loads(chargetune("compare", folder / "study.toml", "--store", path, "--workers", 1, "--json").stdout)["result"][
-        "trial"
-    ]
+    told["compare"] = json.loads(chargetune("compare", folder / "study.toml", "--store", path, "--row", "tuned", "--json").stdout)[
+        "result"
+    ]["trial"]
     told["report"] = read_study(path, NAME).tuned.number
     page = report_page(read_study(path, NAME), evaluate=False)
     told["page"] = told["report"] if f"esult{':' if kept else ','} trial {told['report']}, " in page else None

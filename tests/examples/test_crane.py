@@ -78,7 +78,7 @@ def test_a_move_that_the_user_interrupted_says_nothing_of_theta(example):
 
 def test_one_theta_keeps_every_crane_of_the_range(example, tmp_path):
     crane = example("range_crane")
-    few = crane["ct"].RangeSettings(plants=16, pool=8, iterations=8)
+    few = crane["ct"].RangeSettings(plants=12, pool=4, iterations=6)
     trials, best = crane["tune"](2, 60, tmp_path / "cranes.sqlite", few)
     assert best.score.metrics["violating_plants"] == 0
     assert best.score.metrics["plants"] == 60

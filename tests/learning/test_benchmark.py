@@ -42,7 +42,22 @@ def run_here(monkeypatch, capsys):
 
 def test_a_short_run_and_its_figure(tmp_path, run_here):
     cache = tmp_path / "attainable.json"
-    done = run("learning.py", "--study", "r0", "--methods", "ilc,sobol", "--seeds", "1:2", "--trials", 2, "--json", "--cache", cache)
+    done = run(
+        "learning.py",
+        "--study",
+        "r0",
+        "--methods",
+        "ilc,sobol",
+        "--seeds",
+        "1:2",
+        "--trials",
+        2,
+        "--workers",
+        1,
+        "--json",
+        "--cache",
+        cache,
+    )
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
     assert len(rows) == 4

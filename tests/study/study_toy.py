@@ -138,8 +138,9 @@ def pid_after(pause_s):
 
 
 def begin_and_wait(folder, number):
-    (folder / str(number)).write_text(str(os.getpid()))
     try:
+        # Within: it may be interrupted as soon as it is seen to have begun.
+        (folder / str(number)).write_text(str(os.getpid()))
         time.sleep(600)
     finally:
         (folder / f"{number} left").touch()

@@ -90,8 +90,13 @@ class ProcessExecutor(Executor):
             time.sleep(0.01)
         for process in processes:
             process.kill()
+        managers = [getattr(pool, "_executor_manager_thread", None) for pool in living]
         for pool in living:
             pool.shutdown(wait=False, cancel_futures=True)
+        # Python wakes these threads when it ends, and shows a traceback where one is just closing what it is woken by.
+        for manager in managers:
+            if manager is not None:
+                manager.join(GRACE_S)
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None) -> None:
         if kind is None or issubclass(kind, Exception):

@@ -28,8 +28,8 @@ from charging_problems import changed, charging_problem
 CELL = default_cell()
 # A fifth of the plants, a third of the rounds: a study takes a quarter of the time, and what is asserted of it has room.
 FEW = TwinSettings(plants=12, judges=24, rounds=2)
-# One hour instead of two: a charge whose time counts takes 35 to 50 min.
-HOUR = 360
+# One hour instead of two: a charge whose time counts takes 35 to 50 min. Half as many intervals as usual.
+HOUR = {"steps": 180, "sampling_time_s": 20.0}
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def learn(problem, tuner, count):
 
 def test_four_trials_and_none_breaks_the_limit():
     """Nine R0 nodes, resistances wrong by up to half, 2 mV noise; 36.7 min is what 4000 evaluations of CMA-ES reach."""
-    problem = charge(steps=HOUR)
+    problem = charge(**HOUR)
     trials, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(), settings=FEW), 4)
     np.testing.assert_allclose(trials[0].theta, problem.space.upper)
     assert max(excess) <= 1.0
@@ -91,7 +91,7 @@ def test_four_trials_and_none_breaks_the_limit():
 
 
 def test_a_plant_that_the_twin_cannot_be_is_approached_with_care():
-    problem = charge(plant=TwoPairs(CELL), steps=HOUR)
+    problem = charge(plant=TwoPairs(CELL), **HOUR)
     _, excess, minutes = learn(problem, TwinTuner(ChargingTwin(problem), safety=Safety(), settings=FEW), 4)
     assert max(excess) <= 5.0
     assert excess[-1] <= 2.0
@@ -108,7 +108,7 @@ def test_temperature_and_anode_potential_are_kept_while_learning():
     believed = replace(true, anode=Anode((0.0, 0.5, 1.0), (0.26, 0.07, 0.05), (0.016, 0.016, 0.02)))
     problem = charge(
         cell=believed, plant=AnotherCell(true), R0=None, backoff=Backoff(nodes=5, lower_V=-0.3, upper_V=0.3),
-        temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8, steps=HOUR,
+        temperature_max_K=308.0, anode_min_V=0.0, charge_time_to_soc=0.8, **HOUR,
         temperature_backoff=LimitBackoff(-5.0, 5.0), anode_backoff=LimitBackoff(-0.05, 0.05, nodes=4),
     )  # fmt: skip
     loop = ChargingTwin(problem)

@@ -131,12 +131,15 @@ def check_format(path: str | os.PathLike[str], what: str = "figure") -> str:
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure in the format of the path's ending; the same figure gives the same bytes. Raises ValueError."""
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     target, kind = Path(path), check_format(path)
     with journal_style():
         # The layout depends on the resolution and on the layout before, so it is settled once, at the same one for every format.
-        figure.set_dpi(DPI)
-        figure.canvas.draw()
-        figure.set_layout_engine("none")
+        if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
+            figure.set_dpi(DPI)
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
         content = io.BytesIO()
         figure.savefig(content, format=kind, metadata=METADATA[kind])
     return write_whole(target, content.getvalue())
