@@ -6,13 +6,11 @@ Here the charge is simulated; on a test bench `charge` would run the cycler. Run
 import sys
 
 import chargetune as ct
-from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import evaluate
 
 
 def main(trials, path):
     """A study in a file: stop it at any time, run it again, and it goes on."""
-    config = case_study("backoff", mismatch_seed=1)
+    config = ct.case_study("backoff", mismatch_seed=1)
     problem = config.problem()
     tuner = ct.ConstrainedLogEI(seed=0)
     with (
@@ -26,7 +24,7 @@ def main(trials, path):
                 break
             for trial in waiting:
                 # A charge that did not come to its end has no score: over fewer intervals it would look better.
-                score, episode, ending = evaluate(problem, trial.theta, trial.seed)
+                score, episode, ending = ct.evaluate(problem, trial.theta, trial.seed)
                 if score is None:
                     study.fail(trial.number, ending)
                     continue

@@ -12,28 +12,26 @@ from pathlib import Path
 
 import numpy as np
 
+import chargetune as ct
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.identification.anode import with_anode
-from chargetune.battery.identification.pulse_fit import cell_toml, identify
 from chargetune.battery.identification.record import Record
 from chargetune.battery.identification.thermal import activation_energy, with_thermal
 from chargetune.battery.identification.virtual_bench import pulse_test, slow_cycle
-from chargetune.battery.plants.electrochemical import Electrochemical
-from chargetune.plants.sensors import Sensors
 
 
 def bench(ambient_K, seconds, soc=1.0):
     """The cell at rest in a chamber of this temperature, sampled every ``seconds``."""
-    return Electrochemical(ambient_K=ambient_K).plant(soc, seconds, Sensors())
+    return ct.Electrochemical(ambient_K=ambient_K).plant(soc, seconds, ct.Sensors())
 
 
-capacity = Electrochemical().capacity_Ah
+capacity = ct.Electrochemical().capacity_Ah
 ocv = slow_cycle(bench(298.15, 60.0), capacity_Ah=capacity, voltage_min_V=2.5, voltage_max_V=4.2)
 cells = {}
 for ambient in (283.15, 298.15, 313.15):
     record = pulse_test(lambda seconds, ambient=ambient: bench(ambient, seconds), capacity_Ah=capacity, voltage_min_V=2.5)
-    cells[ambient] = identify(record, capacity_Ah=capacity, ocv=ocv).cell
+    cells[ambient] = ct.identify(record, capacity_Ah=capacity, ocv=ocv).cell
     print(f"{ambient:.0f} K: {cells[ambient].remark}")
 
 limit = Limit("voltage_max_V", 4.2, 0.0)
@@ -71,4 +69,4 @@ files = {
     "okane2022_range.toml": with_anode(cell, charges, nodes=30),
 }
 for name, one in files.items():
-    (folder / name).write_text(cell_toml(one), encoding="utf-8")
+    (folder / name).write_text(ct.cell_toml(one), encoding="utf-8")

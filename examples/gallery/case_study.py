@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import chargetune as ct
-from chargetune.battery.case_study.configurations import case_study
 
 # %%
 # The same plant, the same wrong model, three tuners: points that fill the space, iterative learning, and the twin.
@@ -21,7 +20,7 @@ TRIALS = {"sobol": 20, "iterative_learning": 5, "twin": 4}
 folder = Path(tempfile.mkdtemp())
 found = {}
 for tuner, trials in TRIALS.items():
-    config = case_study("model", mismatch_seed=1, tuner=tuner)
+    config = ct.case_study("model", mismatch_seed=1, tuner=tuner)
     with ct.Store(folder / f"{tuner}.sqlite") as store, ct.open_study(store, config) as study:
         study.run(ct.evaluation_of(tuner, config.problem()), trials)
         found[tuner] = study.trials()

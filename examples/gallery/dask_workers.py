@@ -17,9 +17,6 @@ import matplotlib.pyplot as plt
 from distributed import Client, LocalCluster
 
 import chargetune as ct
-from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import evaluate
-from chargetune.battery.charging.problem import ChargingProblem
 
 TRIALS = 12
 
@@ -30,18 +27,18 @@ TRIALS = 12
 class LongCharge:
     """A charge that seems to last."""
 
-    problem: ChargingProblem
+    problem: ct.ChargingProblem
 
     def __call__(self, theta, seed):
         time.sleep(0.2 + 0.6 * (seed % 101) / 100)
-        return evaluate(self.problem, theta, seed)
+        return ct.evaluate(self.problem, theta, seed)
 
 
 # %%
 # With `workers=2` there are always two trials under way: as soon as one is told, the next theta is proposed. A worker that dies costs
 # nothing but time: its trial begins again elsewhere.
-config = case_study("model", mismatch_seed=1, tuner="sobol")
-evaluate(config.problem(), None, 0)  # compiles the charge
+config = ct.case_study("model", mismatch_seed=1, tuner="sobol")
+ct.evaluate(config.problem(), None, 0)  # compiles the charge
 cluster = LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0")
 store = ct.Store(Path(tempfile.mkdtemp()) / "study.sqlite")
 with cluster, Client(cluster) as client, client.get_executor() as executor, store, ct.open_study(store, config) as study:

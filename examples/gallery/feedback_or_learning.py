@@ -14,15 +14,12 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import chargetune as ct
-from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import evaluate, run_charge
-from chargetune.battery.charging.settings import EstimatorSettings
 
 # %%
 # The published controller does not read the voltage. `mismatch_seed` draws what it wrongly believes.
-config = case_study("model", mismatch_seed=1, tuner="twin")
+config = ct.case_study("model", mismatch_seed=1, tuner="twin")
 problem = config.problem()
-feedback = replace(problem, estimator=EstimatorSettings(kind="offset_free"))
+feedback = replace(problem, estimator=ct.EstimatorSettings(kind="offset_free"))
 
 # %%
 # Learning with the twin: it fits a model of the plant to every sample, three charges suffice.
@@ -33,9 +30,9 @@ with ct.Store(path) as store, ct.open_study(store, config) as study:
 # %%
 # Untuned the limit of 4.2 V is exceeded; both remedies keep it.
 charges = {
-    "untuned": run_charge(problem),
-    "feedback, no trial": run_charge(feedback),
-    "learnt in 3 charges": run_charge(problem, learnt.theta),
+    "untuned": ct.run_charge(problem),
+    "feedback, no trial": ct.run_charge(feedback),
+    "learnt in 3 charges": ct.run_charge(problem, learnt.theta),
 }
 figure, axes = plt.subplots(figsize=(7, 4))
 for name, episode in charges.items():
@@ -45,5 +42,5 @@ axes.set(xlabel="time (min)", ylabel="voltage (V)", ylim=(3.9, 4.3))
 axes.legend()
 
 for name, (one, theta) in {"untuned": (problem, None), "feedback": (feedback, None), "learnt": (problem, learnt.theta)}.items():
-    score, _, _ = evaluate(one, theta, seed=0)
+    score, _, _ = ct.evaluate(one, theta, seed=0)
     print(f"{name:9s} over the limit by {score.metrics['overshoot_mV']:5.1f} mV, 80 % after {score.metrics['t80_min']:.1f} min")

@@ -14,18 +14,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import chargetune as ct
-from chargetune.battery.cell.cell import default_cell
-from chargetune.battery.identification.pulse_fit import cell_toml
 
 # %%
 # Cells that differ by a few per cent as a whole, and a little at each state of charge.
-folder, known, rng, measured = Path(tempfile.mkdtemp()), default_cell(), np.random.default_rng(3), []
+folder, known, rng, measured = Path(tempfile.mkdtemp()), ct.default_cell(), np.random.default_rng(3), []
 (folder / "cells").mkdir()
 for number in range(6):
     whole, nodes = 1 + 0.05 * rng.standard_normal(), 1 + 0.01 * np.cumsum(rng.standard_normal(len(known.soc)))
     R0, R1 = (tuple(whole * nodes * getattr(known, name)) for name in ("R0_ohm", "R1_ohm"))
     measured.append(replace(known, name=f"cell {number}", R0_ohm=R0, R1_ohm=R1, capacity_Ah=known.capacity_Ah * (1.04 - 0.04 * whole)))
-    (folder / "cells" / f"{number}.toml").write_text(cell_toml(measured[-1]))
+    (folder / "cells" / f"{number}.toml").write_text(ct.cell_toml(measured[-1]))
 
 # %%
 # The study file names the folder. The controller knows none of the six: its resistances are wrong by up to half.

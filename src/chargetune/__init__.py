@@ -13,7 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from chargetune.battery.identification.pulse_fit import identify
+    from chargetune.battery.case_study.configurations import case_study
+    from chargetune.battery.cell.cell import Cell, default_cell, load_cell
+    from chargetune.battery.charging.evaluate import evaluate, run_charge
+    from chargetune.battery.charging.problem import ChargingProblem
+    from chargetune.battery.charging.settings import EstimatorSettings
+    from chargetune.battery.identification.cycler_files import read_record
+    from chargetune.battery.identification.pulse_fit import cell_toml, identify
+    from chargetune.battery.plants.electrochemical import Electrochemical
     from chargetune.battery.studies.open_study import evaluation_of, open_study
     from chargetune.battery.studies.study_file import load_config
     from chargetune.control.controller import Controller, SoftLimit, Stage
@@ -46,6 +53,7 @@ if TYPE_CHECKING:
     from chargetune.model.model import Model, Signal
     from chargetune.model.parameter_space import Parameter, ParameterSpace
     from chargetune.plants.gymnasium import GymnasiumPlant
+    from chargetune.plants.plant import Measurement, PlantError
     from chargetune.plants.range_of_use import OwnDraws, RangeOfUse
     from chargetune.plants.sensors import Sensors
     from chargetune.plants.simulated import SimulatedPlant
@@ -56,13 +64,17 @@ if TYPE_CHECKING:
     from chargetune.study.warm_start import Earlier
 
 __all__ = [
+    "Cell",
+    "ChargingProblem",
     "Choice",
     "Composite",
     "ConstrainedLogEI",
     "Controller",
     "Earlier",
+    "Electrochemical",
     "Ending",
     "Episode",
+    "EstimatorSettings",
     "Evaluation",
     "ExactState",
     "ExpectedImprovement",
@@ -70,12 +82,14 @@ __all__ = [
     "GymnasiumPlant",
     "IterativeLearning",
     "LogNormal",
+    "Measurement",
     "Model",
     "NoSafeThetaError",
     "Normal",
     "OwnDraws",
     "Parameter",
     "ParameterSpace",
+    "PlantError",
     "Propagated",
     "RangeEvaluation",
     "RangeOfUse",
@@ -107,14 +121,21 @@ __all__ = [
     "Variation",
     "Windows",
     "__version__",
+    "case_study",
+    "cell_toml",
+    "default_cell",
+    "evaluate",
     "evaluation_of",
     "from_do_mpc",
     "identify",
+    "load_cell",
     "load_config",
     "open_study",
+    "read_record",
     "recompute",
     "recorded_episode",
     "rk4",
+    "run_charge",
     "run_episode",
     "score_limits",
     "simulate",
@@ -125,13 +146,17 @@ __all__ = [
 __version__ = "0.1.0"
 
 _MODULES = {
+    "Cell": "battery.cell.cell",
+    "ChargingProblem": "battery.charging.problem",
     "Choice": "plants.variation",
     "Composite": "learning.black_box.composite",
     "ConstrainedLogEI": "learning.black_box.constrained_ei",
     "Controller": "control.controller",
     "Earlier": "study.warm_start",
+    "Electrochemical": "battery.plants.electrochemical",
     "Ending": "episode.episode",
     "Episode": "episode.episode",
+    "EstimatorSettings": "battery.charging.settings",
     "Evaluation": "episode.score_limits",
     "ExactState": "control.estimators",
     "ExpectedImprovement": "learning.black_box.expected_improvement",
@@ -139,12 +164,14 @@ _MODULES = {
     "GymnasiumPlant": "plants.gymnasium",
     "IterativeLearning": "learning.closed_loop.iterative_learning",
     "LogNormal": "plants.variation",
+    "Measurement": "plants.plant",
     "Model": "model.model",
     "NoSafeThetaError": "learning.safety",
     "Normal": "plants.variation",
     "OwnDraws": "plants.range_of_use",
     "Parameter": "model.parameter_space",
     "ParameterSpace": "model.parameter_space",
+    "PlantError": "plants.plant",
     "Propagated": "control.estimators",
     "RangeEvaluation": "learning.range_of_use.range_verdict",
     "RangeOfUse": "plants.range_of_use",
@@ -175,14 +202,21 @@ _MODULES = {
     "Uniform": "plants.variation",
     "Variation": "plants.variation",
     "Windows": "episode.score_limits",
+    "case_study": "battery.case_study.configurations",
+    "cell_toml": "battery.identification.pulse_fit",
+    "default_cell": "battery.cell.cell",
+    "evaluate": "battery.charging.evaluate",
     "evaluation_of": "battery.studies.open_study",
     "from_do_mpc": "model.do_mpc",
     "identify": "battery.identification.pulse_fit",
+    "load_cell": "battery.cell.cell",
     "load_config": "battery.studies.study_file",
     "open_study": "battery.studies.open_study",
+    "read_record": "battery.identification.cycler_files",
     "recompute": "study.recompute",
-    "rk4": "model.integrators",
     "recorded_episode": "episode.recorded",
+    "rk4": "model.integrators",
+    "run_charge": "battery.charging.evaluate",
     "run_episode": "episode.stepwise",
     "score_limits": "episode.score_limits",
     "simulate": "episode.compiled",
