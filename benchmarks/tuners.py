@@ -25,7 +25,7 @@ sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "examples")]
 
 import torch  # noqa: E402 - the paths of this script come first
 from tuner_suite import machines, processes, reactors  # noqa: E402
-from tuner_suite.methods import LIGHT, METHODS, twins  # noqa: E402
+from tuner_suite.methods import METHODS, twins  # noqa: E402
 from tuner_suite.page import print_table, write_page  # noqa: E402
 from tuner_suite.run import run  # noqa: E402
 from tuner_suite.table import rows  # noqa: E402
@@ -81,8 +81,8 @@ def read(out: Path) -> list[dict]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     args = asked(arguments)
-    if args.light:
-        METHODS.update(twins(LIGHT))
+    if args.full:
+        METHODS.update(twins())
     if args.page:
         write_page(read(args.out), list(PLANTS), list(METHODS), ROOT / "docs", args.command)
         return
@@ -112,11 +112,13 @@ def asked(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--seeds", default="0:10", help="A:B, B not included")
     parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--twin-trials", type=int, help="of the twins, whose proposals take seconds; default: --trials")
+    parser.add_argument("--twin-trials", type=int, default=6, help="of the twins, whose proposals take seconds; 0: as many as --trials")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("out/tuners/runs.jsonl"))
     parser.add_argument("--cache", type=Path, default=Path("out/tuners/oracle"), help="folder of the best theta of each plant")
-    parser.add_argument("--light", action="store_true", help="twins with half the plants and rounds, in a third of the seconds")
+    parser.add_argument(
+        "--full", action="store_true", help="twins with the settings of the package: twice the plants and rounds, thrice the time"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--page", action="store_true")
     parser.add_argument("--command", default="python benchmarks/tuners.py", help="what the page says it was made with")

@@ -43,6 +43,10 @@ class Uniform:
         return space.from_unit(np.random.default_rng([self.seed, len(trials)]).uniform(size=(n, space.dimension)))
 
 
+# About a third of the seconds: half the plants of each ensemble, half the rounds of the search.
+LIGHT = ct.TwinSettings(plants=32, judges=64, rounds=3)
+
+
 def twins(settings: ct.TwinSettings | None = None) -> dict[str, Method]:
     """The tuners with a twin; with other ``settings`` than the package's where they are given."""
     used = settings or ct.TwinSettings()
@@ -55,10 +59,7 @@ def twins(settings: ct.TwinSettings | None = None) -> dict[str, Method]:
     }  # fmt: skip
 
 
-# About a third of the seconds: half the plants of each ensemble, half the rounds of the search.
-LIGHT = ct.TwinSettings(plants=32, judges=64, rounds=3)
-
-METHODS: dict[str, Method] = twins() | {
+METHODS: dict[str, Method] = twins(LIGHT) | {
     "composite": Method(lambda p, seed: ct.Composite(p.windows, seed=seed), "chargetune's composite", "windows"),
     "default": Method(lambda _, seed: ct.ConstrainedLogEI(seed=seed), "chargetune's black box"),
     "ei": Method(lambda _, seed: ct.ExpectedImprovement(seed=seed), "expected improvement on the scalar performance"),
