@@ -182,7 +182,7 @@ def test_verify_evaluates_each_drawn_plant_again(folder, tmp_path, chargetune_he
 
 
 def test_export_has_a_row_for_each_drawn_plant(folder, trials, tmp_path):
-    pandas = pytest.importorskip("pandas")
+    pandas = pytest.importorskip("pandas", reason="pandas is in the extra export")
     chargetune("store", "export", folder / "use.sqlite", "--format", "csv", "--out", tmp_path)
     names = {path.name for path in (tmp_path / "use").iterdir()}
     assert {"trial-0000.bdf.csv", "trial-0000.median.bdf.csv", "trial-0000.best.bdf.csv", "trial-0000.plants.csv"} < names
@@ -194,3 +194,19 @@ def test_export_has_a_row_for_each_drawn_plant(folder, trials, tmp_path):
     # The worst plant's trace is the one of the trial.
     voltage = {name: pandas.read_csv(tmp_path / "use" / f"trial-0000{name}.bdf.csv")["Voltage / V"].max() for name in ("", ".best")}
     assert voltage[""] > voltage[".best"]
+
+
+def test_a_damaged_trace_leaves_the_report_its_other_parts(folder, tmp_path):
+    path = tmp_path / "damaged.sqlite"
+    shutil.copy(folder / "use.sqlite", path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("update trace set data = x'00'")
+    assert "over 12 drawn plants" in report(folder / "use.sqlite", tmp_path / "whole.html")
+    text = report(path, tmp_path / "damaged.html")
+    assert "over 12 drawn plants" not in text
+    assert "is damaged" in text
+
+
+def report(store, page):
+    chargetune("report", store, "-o", page)
+    return page.read_text()

@@ -75,3 +75,14 @@ def test_another_program_would_be_named(released, tmp_path):
     assert f"study {record.name!r}, trial 1: input" in names
     assert f"study {record.name!r}, trial 1: objective" in names
     assert all("trial 1: " in name for name in names)
+
+
+def test_a_password_is_not_printed(postgres):
+    """The same store on a server, by a URL with a password."""
+    location = postgres.replace("postgres:@", "postgres:secret@")
+    assert "secret" in location
+    with Store(location):
+        pass
+    for options in ((), ("--json",)):
+        done = chargetune("verify", location, *options)
+        assert "secret" not in done.stdout + done.stderr

@@ -19,10 +19,13 @@ SQLITE = b"SQLite format 3\0"
 def verify_command(location: str, *, study: str | None, trial: int | None, as_json: bool) -> None:
     """Recompute a certificate, or the trials of a store; exit code 1 when a figure differs."""
     if _is_store(location):
+        from chargetune.cli.output import shown
         from chargetune.cli.verify_store import differences
 
         found, about = differences(location, study, trial, quiet=as_json)
         good = f"{about}: every figure is what theta and seed give"
+        # A URL may hold a password.
+        location = shown(location)
     else:
         for name, value in (("--study", study), ("--trial", trial)):
             if value is not None:

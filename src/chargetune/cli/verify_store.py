@@ -19,7 +19,7 @@ TOLD = (TrialStatus.DONE, TrialStatus.FAILED)
 def differences(location: str, study: str | None, number: int | None, *, quiet: bool) -> tuple[list[Difference], str]:
     """Every difference, and what was evaluated."""
     views = [view for view in read_studies(location) if study in (None, view.name)]
-    if not views:
+    if study is not None and not views:
         raise ValueError(f"study = {study!r}, allowed are {', '.join(view.name for view in read_studies(location))}")
     for view in views:
         if view.record is not None and view.record.hardware:

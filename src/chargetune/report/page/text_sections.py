@@ -19,6 +19,7 @@ from chargetune.report.study_view import StudyView
 from chargetune.report.words import limits_of_study, metrics_of_study, objective_of_study
 from chargetune.runtime.counted import counted
 from chargetune.study.store.database import store_name
+from chargetune.study.store.store import StoreError
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["failures", "limits", "opening", "provenance", "result", "sensitivities", "violations", "what_was_tuned"]
@@ -155,7 +156,11 @@ def result(view: StudyView, feedback: Score | None = None) -> str:
 
 def _by_plant(view: StudyView, best: Trial) -> str:
     """The objective and each excess over the drawn plants of the result, the best plant first."""
-    trace = view.range_trace(best)
+    try:
+        trace = view.range_trace(best)
+    except StoreError:
+        # The limits, checked again from the traces, say that it is damaged.
+        return ""
     if trace is None:
         return ""
     told = objective_of_study(view)
