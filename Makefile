@@ -16,7 +16,7 @@ READY := .venv/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 LOCK_VENV := build/lock-venv
 
-.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock packages packages-core bounds reference docs gallery clean
+.PHONY: help setup demo test tests test-flags test-vm lint types imports bench lock packages packages-core bounds conda reference docs gallery clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
@@ -87,6 +87,11 @@ packages-core: $(READY) ## the same without the extras and the type checker
 bounds: ## test with the lowest and with the newest versions of the dependencies, in environments of their own
 	TORCH_INDEX=$(TORCH_INDEX) $(PYTHON) .ci/bounds.py lowest
 	TORCH_INDEX=$(TORCH_INDEX) $(PYTHON) .ci/bounds.py newest
+
+conda: $(READY) ## build and test the conda recipe, with the locked packages as its channel
+	$(BIN)/python -m venv build/conda-venv
+	build/conda-venv/bin/pip install --quiet packaging py-rattler-build pyyaml
+	build/conda-venv/bin/python .ci/conda.py "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 # -W: a warning, such as a link that leads nowhere, is an error.
 docs: $(READY) ## build the site into build/site, without running the scripts of the gallery
