@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sqlite3
+from pathlib import Path
 
 import pytest
 from commands import chargetune
@@ -16,6 +17,7 @@ from chargetune.verify import verify
 from chargetune.web.app import make_app
 from study_text import study_text
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 RANGE = {"soc_start": [0.3, 0.5], "resistance": 0.1, "growth": 0.2, "draws": 12}
 TABLES = {
     "study": {"name": "use", "tuner": "range", "trials": 2},
@@ -117,17 +119,32 @@ def test_the_certificate_is_of_the_range_that_theta_was_tuned_for(folder):
     assert json.loads((folder / "d.json").read_text())["range"]["growth"] == 0
 
 
-@pytest.mark.parametrize(
-    ("tables", "words"),
-    [
-        ({}, "tuner = 'range' is given without a table [range]"),
-        ({"range": RANGE, "plant": {"model": "SPM"}}, "tuner = 'range' is given with an electrochemical [plant]"),
-    ],
-)
-def test_a_range_that_cannot_be_tuned_is_refused(tables, words, tmp_path, refused):
+def test_a_range_that_cannot_be_tuned_is_refused(tmp_path, refused):
     path = tmp_path / "s.toml"
-    path.write_text(study_text(**TABLES, **tables))
-    assert words in refused("tune", path, "--store", tmp_path / "s.sqlite")
+    path.write_text(study_text(**TABLES))
+    assert "tuner = 'range' is given without a table [range]" in refused("tune", path, "--store", tmp_path / "s.sqlite")
+
+
+def test_a_range_of_an_electrochemical_plant(tmp_path):
+    # A single particle at its voltage limit, which the sensor reads up to 4 mV too low: so far theta has to stay away.
+    tables = {
+        "study": {"name": "own", "tuner": "range", "trials": 1},
+        "cell": {"file": str(EXAMPLES / "okane2022.toml")},
+        "controller": {"horizon": 2, "sampling_time_s": 60.0},
+        "plant": {"model": "SPM"},
+        "estimator": {"kind": "offset_free"},
+        "estimator.offset_free": {"soc": "measured", "backoff_sd": 0.0},
+        "limits": {"current_max_A": 10.0, "tolerance_V": 0.0001},
+        "episode": {"steps": 5, "soc_start": 0.75},
+        "theta.backoff": {"nodes": 2, "lower_V": 0.0, "upper_V": 0.02},
+        "range": {"voltage_bias_V": 0.004, "draws": 3},
+    }
+    (tmp_path / "s.toml").write_text(study_text(**tables))
+    told = json.loads(chargetune("tune", tmp_path / "s.toml", "--store", tmp_path / "s.sqlite", "--workers", 2, "--json").stdout)
+    assert told["tuned"]["metrics"]["plants"] == 3
+    assert told["tuned"]["feasible"]
+    assert max(told["theta"].values()) > 0.0035
+    assert json.loads(chargetune("verify", tmp_path / "s.sqlite", "--json").stdout)["verified"]
 
 
 def test_compare_charges_the_same_drawn_plants_in_every_way(folder, trials):

@@ -119,7 +119,13 @@ def tune(
     store: Annotated[
         str | None, typer.Option(help="Where trials are kept, a file or postgresql://...; by default OUT/study.sqlite or CONFIG's name.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Worker processes: for the batches of the file, else a trial each.")] = 1,
+    workers: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            help="Worker processes: for the batches of the file, else a trial each; of the tuner 'range' with a [plant] a plant each.",
+        ),
+    ] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and the summary.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Tune although the check of the formulation finds an error.")] = False,
     accept_changed: Annotated[bool, typer.Option("--accept-changed", help="Resume although the study file has changed.")] = False,

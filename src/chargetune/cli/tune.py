@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,9 @@ from chargetune.study.study import Study
 from chargetune.study.trial import Trial, TrialStatus
 
 __all__ = ["bar", "tune_command"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 # Said of a result that `chargetune certify` will mostly find to break its limits.
 ONE_CELL = """this theta holds for the cell and the start that it was tuned on, others may
@@ -147,7 +151,8 @@ def _run(
     config, kept = opening.config, opening.kept
     with ExitStack() as stack:
         store = stack.enter_context(Store(kept))
-        study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed))
+        plants = _plants_executor(config, problem, workers, stack)
+        study = stack.enter_context(open_study(store, config, opening.folder, accept_changed=opening.accept_changed, executor=plants))
         known = study.trials()
         done = sum(t.status is not TrialStatus.RUNNING for t in known)
         # Without batches more workers have something to do only if the order of the trials is given up for them; and
@@ -155,6 +160,8 @@ def _run(
         alone = study.batch > 1 or config.safety is not None or config.study.tuner in ("iterative_learning", "range")
         alone = alone or config.range is not None
         at_once = min(study.batch, max(1, count - done)) if alone else max(1, count - done)
+        if plants is not None:
+            workers = 1
         workers = workers_for(workers, at_once, ("trial at a time", "trials at a time") if alone else ("trial", "trials"))
         executor = stack.enter_context(process_executor(workers)) if workers > 1 else None
         progress = stack.enter_context(bar(quiet=quiet))
@@ -174,6 +181,8 @@ def _run(
                 said = f"{'last' if own else 'best'} {_headline(config, problem, trial.score)} (trial {trial.number})"
             progress.update(task, advance=1, note=progress_note(said, violating, failures))
 
+        if plants is not None:
+            plants.tell = lambda charges: progress.update(task, note=counted(charges, "simulated charge"))
         stack.enter_context(_said(progress.console))
         # A tuner has loaded this folder by now.
         from chargetune.learning import NoSafeThetaError
@@ -181,7 +190,7 @@ def _run(
         stopped = ""
         try:
             ahead = workers if workers > 1 and not alone else None
-            study.run(evaluation_of(config.study.tuner, problem), count, executor=executor, workers=ahead, progress=note)
+            study.run(evaluation_of(config.study.tuner, problem, plants), count, executor=executor, workers=ahead, progress=note)
         except NoSafeThetaError as error:
             stopped = str(error)
         stored = study.trials()
@@ -191,6 +200,31 @@ def _run(
         study.result()
         result = read_result(store, study.record, everything)
     return everything, more, result, safety
+
+
+class _PlantsExecutor(Executor):
+    """Runs charges of one theta on many plants in worker processes, and tells how many are done."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor, self._done = executor, 0
+        self.tell: Callable[[int], None] = lambda _: None
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        future = self._executor.submit(fn, *args, **kwargs)
+        future.add_done_callback(self._count)
+        return future
+
+    def _count(self, _: Future[Any]) -> None:
+        self._done += 1
+        self.tell(self._done)
+
+
+def _plants_executor(config: Config, problem: ChargingProblem, workers: int, stack: ExitStack) -> _PlantsExecutor | None:
+    """What runs the plants of one trial over a range, where a charge takes seconds."""
+    if config.study.tuner != "range" or problem.range is None or problem.plant_cell is not None:
+        return None
+    workers = workers_for(workers, problem.range.draws, ("plant", "plants"))
+    return _PlantsExecutor(stack.enter_context(process_executor(workers)))
 
 
 def progress_note(said: str, violating: int, failures: int) -> str:

@@ -10,8 +10,10 @@ from chargetune.battery.cell.thermal import Thermal
 from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.range_settings import MEANING, ChargingRangeSettings, range_line
 from chargetune.battery.charging.tunables import Backoff
+from chargetune.battery.plants.electrochemical import Electrochemical
 from chargetune.battery.studies.open_study import evaluation_of
 from chargetune.battery.studies.study_file import load_config, problem_of_document
+from chargetune.study.executors import process_executor
 from charging_problems import charging_problem
 
 CELL = default_cell()
@@ -134,3 +136,18 @@ def test_the_line_of_a_range():
     assert settings.line == "soc_start 0.05 to 0.5, resistance +-0.2, growth 0.5"
     assert settings.names == ("soc_start", "resistance", "growth")
     assert range_line(ChargingRangeSettings().entries) == "nothing differs but the noise"
+
+
+def test_charges_of_an_electrochemical_plant_are_the_same_in_other_processes():
+    problem = charging_problem(CELL, plant=Electrochemical("SPM"), steps=4, backoff=Backoff(nodes=2))
+    problem = replace(problem, range=ChargingRangeSettings(soc_start=(0.3, 0.5), capacity=0.1, growth=0.5))
+    use, theta = ChargingRange(problem), problem.space.default
+    plants = use.draw(2, 5)
+    here = use.run([theta] * 2, plants)
+    with process_executor(2) as executor:
+        there = replace(use, executor=executor).run([theta] * 2, plants)
+        assert replace(use, executor=executor).run([], []) == []
+    for one, other in zip(here, there, strict=True):
+        np.testing.assert_array_equal(one.output_end, other.output_end)
+        np.testing.assert_array_equal(one.input, other.input)
+    assert not np.array_equal(here[0].output_end, here[1].output_end)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -99,10 +100,14 @@ class ChargingRange:
 
     The controller is the same for all of them: what it knows of a start it measures. Of an `Electrochemical` plant vary what
     `electrochemical` says; what else the settings ask for is refused, and so is another plant: ValueError.
+
+    executor
+        Runs the charges of an electrochemical plant, each of which takes seconds; None: one after the other in this process.
     """
 
     # A study's configuration is this problem already, so its identity does not hold it twice.
     problem: ChargingProblem = field(metadata={"identity": False})
+    executor: Executor | None = field(default=None, compare=False, repr=False, metadata={"identity": False})
 
     def __post_init__(self) -> None:
         if self.problem.range is None:
@@ -143,14 +148,10 @@ class ChargingRange:
             return [replace(self._loop, plant=one.plant).run(theta, one.seed, trips) for theta, one in zip(own, plants, strict=True)]
         if self.problem.plant_cell is not None:
             return self._loop.run_each(own, [one.plant for one in plants], [one.seed for one in plants])
-        from chargetune.episode.stepwise import run_episode
-
-        controller, steps = controller_of(self.problem), self.problem.episode.steps
-        control = compiled_act(controller)
-        return [
-            run_episode(controller, self.plant_of(one), steps=steps, theta=theta, seed=one.seed, trips=trips, control=control)
-            for theta, one in zip(own, plants, strict=True)
-        ]
+        tasks = [(self.problem, self.plant_of(one), theta, one.seed, tuple(trips)) for theta, one in zip(own, plants, strict=True)]
+        if self.executor is None or not tasks:
+            return [_stepped(*task) for task in tasks]
+        return list(self.executor.map(_stepped, *zip(*tasks, strict=True)))
 
     def _theta(self, theta: NDArray[np.float64], drawn: DrawnPlant) -> NDArray[np.float64]:
         """The controller's theta in the context of this draw."""
@@ -206,3 +207,12 @@ class ChargingRange:
     @cached_property
     def _exact(self) -> ChargingProblem:
         return judged_exactly(self.problem)
+
+
+def _stepped(problem: ChargingProblem, plant: Plant, theta: NDArray[np.float64], seed: int, trips: Sequence[Trip]) -> Episode:
+    """One charge of a plant that is no circuit."""
+    from chargetune.episode.stepwise import run_episode
+
+    controller = controller_of(problem)
+    control = compiled_act(controller)
+    return run_episode(controller, plant, steps=problem.episode.steps, theta=theta, seed=seed, trips=trips, control=control)

@@ -257,9 +257,10 @@ def _signals_after() -> Iterator[None]:
             own[signal.Signals(came)](came, frame)
 
 
-@lru_cache(maxsize=8)
+# A search over a range of use returns to some twenty plants; each has 15 MB.
+@lru_cache(maxsize=24)
 def _built(settings: Electrochemical, soc_start: float) -> _Built:
-    """The discretised model at rest at ``soc_start``; 0.2 s, after 2 s for the import of pybamm."""
+    """The discretised model at rest at ``soc_start``; a second, after 2 s for the import of pybamm."""
     # PyBaMM would ask on the terminal whether it may report usage.
     os.environ.setdefault("PYBAMM_DISABLE_TELEMETRY", "true")
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,30 +20,30 @@ from chargetune.study.store.store import Store
 from chargetune.study.study import Proposer, Study
 
 if TYPE_CHECKING:
+    from chargetune.learning.range_of_use.range_tuner import RangeSettings
     from chargetune.learning.range_of_use.range_verdict import RangeEvaluation
 
 __all__ = ["evaluation_of", "make_tuner", "open_study"]
 
 
-def evaluation_of(name: TunerName, problem: ChargingProblem) -> Evaluate:
+def evaluation_of(name: TunerName, problem: ChargingProblem, executor: Executor | None = None) -> Evaluate:
     """What a trial of this tuner is, as `Study.run` takes it: ``study.run(evaluation_of(config.study.tuner, config.problem()), 4)``.
 
     One charge; with "range" a theta on fresh draws of the range of use (`RangeEvaluation`); with "twin" over a range one charge under a
-    condition that the trial's seed draws. Raises ValueError for "range" without a range of use, or on an electrochemical plant.
+    condition that the trial's seed draws. Raises ValueError for "range" without a range of use. ``executor`` runs the plants of one
+    trial of "range" at a time where they are electrochemical.
     """
     if name == "twin" and problem.range is not None:
         return RangeCharge(problem)
-    return _over_range(problem) if name == "range" else Evaluation(problem)
+    return _over_range(problem, executor) if name == "range" else Evaluation(problem)
 
 
-def _over_range(problem: ChargingProblem) -> RangeEvaluation:
+def _over_range(problem: ChargingProblem, executor: Executor | None) -> RangeEvaluation:
     if problem.range is None:
         raise ValueError("tuner = 'range' is given without a table [range], which says what differs between the charges")
-    if problem.plant_cell is None:
-        raise ValueError("tuner = 'range' is given with an electrochemical [plant], allowed is a circuit, of which hundreds are drawn")
     from chargetune import learning
 
-    return learning.RangeEvaluation(ChargingRange(problem), problem.range.draws, problem.range.objective_quantile)
+    return learning.RangeEvaluation(ChargingRange(problem, executor), problem.range.draws, problem.range.objective_quantile)
 
 
 def make_tuner(
@@ -50,9 +51,11 @@ def make_tuner(
     seed: int,
     problem: ChargingProblem,
     unknown: TwinTable | None = None,
+    executor: Executor | None = None,
 ) -> Proposer:
     """The tuner that a configuration names; the twin simulates the problem's controller, and is safe where the problem says how.
 
+    ``executor``: as in `evaluation_of`, for the charges with which "range" chooses theta.
     Raises ValueError when it is to be safe and cannot.
     """
     safety = problem.safety
@@ -94,12 +97,23 @@ def make_tuner(
         "sobol": lambda s: learning.Sobol(seed=s),
         "composite": lambda s: learning.Composite(ChargingWindows(problem), seed=s),
         "iterative_learning": lambda _: learning.IterativeLearning(twin),
-        "range": lambda s: learning.RangeTuner(
-            _over_range(problem), seed=s, settings=learning.RangeSettings(drop_idle=problem.range is not None and problem.range.drop_idle)
-        ),
+        "range": lambda s: learning.RangeTuner(_over_range(problem, executor), seed=s, settings=_search_of(problem)),
         "twin": lambda s: learning.TwinTuner(twin, seed=s, safety=safe),
     }
     return makers[name](seed)
+
+
+def _search_of(problem: ChargingProblem) -> RangeSettings:
+    """A charge of an electrochemical plant takes as long as a thousand of a circuit: fewer plants, and one start of the search.
+
+    So few say less of those that were not drawn: all of the tolerance is left for these.
+    """
+    from chargetune import learning
+
+    drop_idle = problem.range is not None and problem.range.drop_idle
+    if problem.plant_cell is not None:
+        return learning.RangeSettings(drop_idle=drop_idle)
+    return learning.RangeSettings(plants=12, added=6, first=4, pool=0, corners=8, iterations=6, aim=0.0, drop_idle=drop_idle)
 
 
 def _model_spread(problem: ChargingProblem, unknown: TwinTable | None) -> float:
@@ -121,8 +135,10 @@ def _unpredicted(what: str, limits: Sequence[str]) -> str:
     )
 
 
-def open_study(store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False) -> Study:
-    """The study of a configuration, begun or resumed; see `Study.create_or_resume`."""
+def open_study(
+    store: Store, config: Config, folder: Path | None = None, *, accept_changed: bool = False, executor: Executor | None = None
+) -> Study:
+    """The study of a configuration, begun or resumed; see `Study.create_or_resume`. ``executor``: as in `make_tuner`."""
     if config.safety and config.study.earlier:
         raise ValueError(
             "[safety] is given with [[study.earlier]]: the trials of an earlier study may be of another cell, and what that one allowed "
@@ -130,7 +146,7 @@ def open_study(store: Store, config: Config, folder: Path | None = None, *, acce
         )
     problem = config.problem(folder)
     with config.named():
-        tuner = make_tuner(config.study.tuner, config.study.seed, problem, config.twin)
+        tuner = make_tuner(config.study.tuner, config.study.seed, problem, config.twin, executor)
     return Study.create_or_resume(
         store,
         config.study.name,
