@@ -11,7 +11,7 @@ from chargetune.battery.charging.charging_range import ChargingRange
 from chargetune.battery.charging.range_settings import MEANING, ChargingRangeSettings, range_line
 from chargetune.battery.charging.tunables import Backoff
 from chargetune.battery.plants.electrochemical import Electrochemical
-from chargetune.battery.studies.open_study import evaluation_of
+from chargetune.battery.studies.open_study import evaluation_of, make_tuner
 from chargetune.battery.studies.study_file import load_config, problem_of_document
 from chargetune.study.executors import process_executor
 from charging_problems import charging_problem
@@ -151,3 +151,12 @@ def test_charges_of_an_electrochemical_plant_are_the_same_in_other_processes():
         np.testing.assert_array_equal(one.output_end, other.output_end)
         np.testing.assert_array_equal(one.input, other.input)
     assert not np.array_equal(here[0].output_end, here[1].output_end)
+
+
+def test_the_search_over_an_electrochemical_plant_leaves_all_of_the_tolerance_to_plants_that_it_did_not_draw():
+    circuit = replace(charging_problem(CELL, backoff=Backoff(nodes=2)), range=ChargingRangeSettings(soc_start=(0.3, 0.5), drop_idle=True))
+    many, few = (make_tuner("range", 0, replace(circuit, plant=plant)).settings for plant in (None, Electrochemical("SPM")))
+    assert few.plants < many.plants
+    assert few.aim == 0.0 < many.aim
+    assert few.drop_idle
+    assert many.drop_idle
