@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,8 @@ __all__ = ["Choice", "Proposed", "RangeTwinSettings", "RangeTwinTuner"]
 
 # With which the draws that judge a theta have to show that it keeps its limits on the stated share.
 CONFIDENCE = 0.95
+# Most draws that judge a theta, a minute of charges: 0.9999 can be shown with as many, hardly more is known of any range.
+JUDGES_MAX = 30_000
 # Proposals that are kept: a study that is opened again asks for the same ones.
 _PROPOSED: Built = Built(16, casadi=False)
 
@@ -56,8 +59,9 @@ class RangeTwinSettings:
     """Numbers of the learning over a range, each with the reason for its value.
 
     rounds, judges
-        Searches for one theta, each on the plants that were nearest to a limit in those before it, and the fresh draws that judge each.
-        One search leaves a per cent of the draws beyond a limit, three about none.
+        Searches for one theta, each on the plants that were nearest to a limit in those before it, and the fresh draws that judge each;
+        more where so few cannot show the demanded probability (0.999: 2995). One search leaves a per cent of the draws beyond a limit,
+        three about none.
     first, later
         Settings of the search without a trace, and after one, when what is left differs less. From the last theta alone it stops at one
         that is careful where nothing asks for it any more, so it has other starts too.
@@ -109,8 +113,8 @@ class RangeTwinTuner:
     2. With traces: the numbers of the plant are those that the traces leave (Laplace, with the range as prior), with what the model cannot
        represent (`Discrepancy`); those of the episode are drawn anew, as before. theta is chosen on draws of that in the same way.
     3. It is proposed if it keeps every limit on so many of the fresh draws that they show ``safety.probability`` with a confidence of 95 %
-       (of 300 all for 0.99, and 292 for 0.95), and is better there than the theta tried last; else that one again, if it does; else
-       whichever keeps them on at least the stated share; else the one of the first trial.
+       (of 300 all for 0.99, and 292 for 0.95; of 2995 all for 0.999), and is better there than the theta tried last; else that one again,
+       if it does; else whichever keeps them on at least the stated share; else the one of the first trial.
     4. Where the traces are of no plant of the range (`Learnt.rejected`) the first trial's theta again, with a warning. Where the newest
        episode kept every limit, and hardly a draw does with its theta, that one again, with a warning: the draws are not of this plant.
 
@@ -190,7 +194,7 @@ class RangeTwinTuner:
         return Proposed(tuple(first), Choice.REPEATED, share, f"the first one keeps every limit on {share:.3f} of them")
 
     def _evaluation(self, loop: ConditionedRange) -> RangeEvaluation:
-        return RangeEvaluation(loop, self.settings.judges, self.settings.objective_quantile)
+        return RangeEvaluation(loop, self._judges, self.settings.objective_quantile)
 
     def _search(
         self, space: ParameterSpace, loop: ConditionedRange, settings: RangeSettings, number: int
@@ -219,10 +223,16 @@ class RangeTwinTuner:
         """The share of fresh draws that is aimed at: the least that shows the stated one (Clopper and Pearson); inf where there is none."""
         from scipy.stats import beta
 
-        kept = np.arange(1, self.settings.judges + 1)
-        enough = kept[beta.ppf(1.0 - CONFIDENCE, kept, self.settings.judges - kept + 1) >= self.safety.probability]
+        kept = np.arange(1, self._judges + 1)
+        enough = kept[beta.ppf(1.0 - CONFIDENCE, kept, self._judges - kept + 1) >= self.safety.probability]
         # Half a draw less, so that rounding decides nothing.
-        return float(enough[0] - 0.5) / self.settings.judges if enough.size else np.inf
+        return float(enough[0] - 0.5) / self._judges if enough.size else np.inf
+
+    @property
+    def _judges(self) -> int:
+        """Fresh draws that judge a theta: if all of n keep the limits, that shows p where p^n <= 1 - confidence."""
+        needed = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(self.safety.probability))
+        return max(self.settings.judges, min(needed, JUDGES_MAX))
 
     def _check_budget(self, done: Sequence[TrialLike]) -> None:
         if self.safety.budget is None:
