@@ -1,6 +1,6 @@
 """Learning over a range of use, on a heater whose best theta is known in closed form for every plant."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -184,6 +184,24 @@ def test_numbers_of_the_settings_are_checked():
             ct.RangeTwinSettings(**{name: 0})
     with pytest.raises(ValueError, match=r"range twin settings: contradicted = 1\.0, allowed is \[0, 1\)"):
         ct.RangeTwinSettings(contradicted=1.0)
+
+
+@pytest.mark.parametrize(("probability", "count"), [(0.95, 150), (0.99, 299), (0.999, 2995)])
+def test_as_many_draws_judge_a_theta_as_can_show_the_probability(probability, count):
+    drawn = []
+
+    @dataclass(frozen=True)
+    class Counting(ct.SimulatedRangeTwin):
+        def draw(self, count, seed, scores=None, *, extreme=None):
+            drawn.append(count)
+            return super().draw(count, seed, scores, extreme=extreme)
+
+    found = ct.RangeTwinTuner(Counting(LOOP.range), 5, ct.Safety(probability), SETTINGS).proposed(SPACE, [])
+    assert max(drawn) == count
+    assert found.probability >= probability
+    if count > 150:
+        # One draw less would not show it: so many of them keep the limits by chance at a share just below (binomial distribution).
+        assert probability**count <= 0.05 < probability ** (count - 1)
 
 
 def test_scores_of_the_nominal_plant_change_nothing():
