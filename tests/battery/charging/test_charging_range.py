@@ -148,9 +148,10 @@ def test_charges_of_an_electrochemical_plant_are_the_same_in_other_processes():
         there = replace(use, executor=executor).run([theta] * 2, plants)
         assert replace(use, executor=executor).run([], []) == []
     for one, other in zip(here, there, strict=True):
-        np.testing.assert_array_equal(one.output_end, other.output_end)
-        np.testing.assert_array_equal(one.input, other.input)
-    assert not np.array_equal(here[0].output_end, here[1].output_end)
+        # A worker has one thread of linear algebra, this process may have more, so sums may be rounded otherwise.
+        np.testing.assert_allclose(one.output_end, other.output_end, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(one.input, other.input, rtol=0, atol=1e-4)
+    assert np.max(np.abs(here[0].output_end - here[1].output_end)) > 1e-2
 
 
 def test_the_search_over_an_electrochemical_plant_leaves_all_of_the_tolerance_to_plants_that_it_did_not_draw():
