@@ -30,8 +30,8 @@ def evaluation_of(name: TunerName, problem: ChargingProblem, executor: Executor 
     """What a trial of this tuner is, as `Study.run` takes it: ``study.run(evaluation_of(config.study.tuner, config.problem()), 4)``.
 
     One charge; with "range" a theta on fresh draws of the range of use (`RangeEvaluation`); with "twin" over a range one charge under a
-    condition that the trial's seed draws. Raises ValueError for "range" without a range of use. ``executor`` runs the plants of one
-    trial of "range" at a time where they are electrochemical.
+    condition that the trial's seed draws. Raises ValueError for "range" without a range of use. ``executor`` charges the
+    plants of a trial of "range" where they are electrochemical; None: this process, one after the other.
     """
     if name == "twin" and problem.range is not None:
         return RangeCharge(problem)
