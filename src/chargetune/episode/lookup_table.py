@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+
+from chargetune.episode.episode import Episode
 
 __all__ = ["LookupTable"]
 
@@ -82,6 +84,23 @@ class LookupTable:
         out = np.zeros((len(at), self.size))
         np.put_along_axis(out, nodes, shares, axis=1)
         return out
+
+    def true_outputs(self, episode: Episode, table: NDArray[np.float64] | None) -> Episode:
+        """A simulated episode without the noise of its sensors: its model's outputs, and what the table says there; None: nothing."""
+        true = episode.noise_free()
+        if table is None:
+            return true
+        columns, both = [true.output_names.index(name) for name in self.outputs], []
+
+        def along(name: str, k: int) -> NDArray[np.float64]:
+            return true.signal(name)[k] if name in true.output_names else true.input[:, true.input_names.index(name)]
+
+        for k, outputs in enumerate((true.output_start, true.output_end)):
+            nodes, shares = self.around(np.stack([along(name, k) for name, _, _ in self.ranges], axis=1))
+            out = outputs.copy()
+            out[:, columns] += np.sum(table[:, nodes] * shares, axis=-1).T
+            both.append(out)
+        return replace(true, output_start=both[0], output_end=both[1])
 
     def coefficients(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
         """A table as the last argument of `function`. Raises ValueError for another shape than (outputs, nodes)."""

@@ -1,5 +1,6 @@
 """The twin loop of any system, against episodes run step by step."""
 
+import zlib
 from dataclasses import replace
 
 import casadi as ca
@@ -10,6 +11,7 @@ from chargetune.control.controller import Controller, SoftLimit
 from chargetune.episode.episode import Ending
 from chargetune.episode.score_limits import ScoredLimit, Windows
 from chargetune.episode.stepwise import run_episode
+from chargetune.learning.twin.discrepancy import NoDiscrepancy
 from chargetune.learning.twin.rollout import predict, slopes
 from chargetune.learning.twin.simulated_twin import SimulatedTwin
 from chargetune.learning.twin.twin import Uncertain
@@ -64,6 +66,18 @@ def test_members_are_the_plants_of_their_unknowns_step_by_step():
         expected = run_episode(CONTROLLER, plant, steps=20, theta=theta)
         np.testing.assert_allclose(found.output_end, expected.output_end, atol=1e-7)
         np.testing.assert_allclose(found.input, expected.input, atol=1e-6)
+
+
+def test_a_drawn_member_is_read_with_noise_and_judged_without():
+    """Step by step with sensors of the same seed: the controller follows the noise, what comes back is what was true and the bias."""
+    loop, m = build(), np.array([0.1, 0.2, 0.03])
+    plant = SimulatedPlant(tank(0.1 * np.exp(0.1)), {"level": 1.2}, Sensors({"level": 1e-3}, {"level": 0.03}))
+    for theta in (np.array([0.1]), np.array([0.3])):
+        (found,), (quiet,) = (loop.simulate([(theta, m, drawn)]) for drawn in (NoDiscrepancy(), None))
+        expected = run_episode(CONTROLLER, plant, steps=20, theta=theta, seed=zlib.crc32(m.tobytes()))
+        np.testing.assert_allclose(found.input, expected.input, atol=1e-6)
+        assert np.abs(found.input - quiet.input).max() > 1e-4
+        np.testing.assert_allclose(found.signal("level")[1], expected.signal("level", true=True)[1] + 0.03, atol=1e-7)
 
 
 def test_the_verdict_is_that_of_the_limits():

@@ -118,14 +118,16 @@ class ChargingTwin:
         return row_tolerances(self.problem)
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
-        """Charges without noise, with the discrepancy of each member added to what is measured and so to what the estimator reads."""
+        """Charges with their true outputs; the estimator reads them with the noise of the study's sensors."""
         return self._simulator.simulate(members)
 
     @cached_property
     def _simulator(self) -> TwinSimulator:
         from chargetune.learning.twin.simulated_twin import TwinSimulator
 
-        return TwinSimulator(self.controller, self.twin, self.features, self.problem.episode.steps)
+        # A bias is not known of a cell; what may be unknown so is an unknown of the twin.
+        sensors = replace(self.problem.sensors.sensors(), bias={})
+        return TwinSimulator(self.controller, self.twin, self.features, self.problem.episode.steps, sensors=sensors)
 
     def violation(self, episode: Episode) -> float:
         """Overshoot of the upper voltage limit beyond its tolerance, as judged, over time, mV s."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -66,22 +66,7 @@ def run_drawn(
     errors = [(nothing if one.error is None else one.error) for one in plants] if off else [None] * len(plants)
     run = loop(table if off else None)
     episodes = run.run_each(list(thetas), [one.plant for one in plants], [one.seed for one in plants], errors)
-    return [_true(e, table, error) if e.ending is Ending.DONE else None for e, error in zip(episodes, errors, strict=True)]
-
-
-def _true(episode: Episode, table: LookupTable, error: NDArray[np.float64] | None) -> Episode:
-    true = episode.noise_free()
-    if error is None:
-        return true
-    columns, both = [true.output_names.index(name) for name in table.outputs], []
-    names = [name for name, _, _ in table.ranges]
-    for k, outputs in enumerate((true.output_start, true.output_end)):
-        at = np.stack([true.signal(n)[k] if n in true.output_names else true.input[:, true.input_names.index(n)] for n in names], axis=1)
-        nodes, shares = table.around(at)
-        out = outputs.copy()
-        out[:, columns] += np.sum(error[:, nodes] * shares, axis=-1).T
-        both.append(out)
-    return replace(true, output_start=both[0], output_end=both[1])
+    return [table.true_outputs(e, error) if e.ending is Ending.DONE else None for e, error in zip(episodes, errors, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from chargetune.learning.twin.settings import TwinSettings
 from chargetune.runtime.counted import counted
 from chargetune.runtime.threads import parallel_map
 
-__all__ = ["Discrepancy", "DiscrepancySample"]
+__all__ = ["Discrepancy", "DiscrepancySample", "NoDiscrepancy"]
 
 # Relative to the prior variance: what keeps a covariance of neighbouring nodes from being singular to rounding.
 JITTER = 1e-8
@@ -71,7 +71,7 @@ class Discrepancy:
     def mean(self, unknowns: NDArray[np.float64]) -> DiscrepancySample:
         """What is expected of the discrepancy of a plant at ``unknowns`` (d,)."""
         left = self._residuals(unknowns)
-        return DiscrepancySample(self, np.stack([part.gain @ left[:, i] for i, part in enumerate(self.stated)]))
+        return DiscrepancySample(self, np.stack([part.gain @ left[:, i] for i, part in enumerate(self.stated)]), drawn=False)
 
     def samples(self, unknowns: NDArray[np.float64], scale: float, seeds: Sequence[int]) -> list[DiscrepancySample]:
         """A sample for each of several plants, unknowns of shape (plants, d), each with its seed."""
@@ -174,10 +174,14 @@ class Discrepancy:
 
 @dataclass(frozen=True)
 class DiscrepancySample:
-    """What the twin cannot represent of one plant: ``table`` has the shape (outputs, nodes), on ``discrepancy.lookup_table``."""
+    """What the twin cannot represent of one plant: ``table`` has the shape (outputs, nodes), on ``discrepancy.lookup_table``.
+
+    ``drawn``: it is a draw; else the mean, which is that of no plant.
+    """
 
     discrepancy: Discrepancy
     table: NDArray[np.float64]
+    drawn: bool = True
 
     def __call__(self, episode: Episode) -> Episode:
         """A predicted episode -> the same with this added to its outputs."""
@@ -191,6 +195,17 @@ class DiscrepancySample:
             out[:, columns] += np.sum(self.table[:, nodes] * shares, axis=-1).T
             changed.append(out)
         return replace(episode, output_start=changed[0], output_end=changed[1])
+
+
+@dataclass(frozen=True)
+class NoDiscrepancy:
+    """Of a plant that is drawn before the first trace: the model is right but for the unknowns."""
+
+    table: float = 0.0
+    drawn: bool = True
+
+    def __call__(self, episode: Episode) -> Episode:
+        return episode
 
 
 class _Data(NamedTuple):

@@ -15,7 +15,7 @@ from chargetune.episode.score import Score
 from chargetune.learning.closed_loop.loop import Simulate, windows_of
 from chargetune.learning.tuner import TrialLike
 from chargetune.learning.twin.calibration import SCALES, PredictionCheck, check_prediction, scale_quantile
-from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample
+from chargetune.learning.twin.discrepancy import Discrepancy, DiscrepancySample, NoDiscrepancy
 from chargetune.learning.twin.laplace import fit
 from chargetune.learning.twin.posterior import Posterior
 from chargetune.learning.twin.rollout import predict_each
@@ -118,7 +118,7 @@ class Ensemble:
         for values, (_, error) in zip(predicted, members, strict=True):
             own = replace(episode, output_start=episode.output_start.copy(), output_end=episode.output_end.copy())
             own.output_start[:, columns], own.output_end[:, columns] = values[:, 0], values[:, 1]
-            out.append(error(own) if error else own)
+            out.append(error(own))
         return Prediction(self.loop, tuple(out), self.settings.near)
 
     @cached_property
@@ -126,11 +126,11 @@ class Ensemble:
         mode = self.learnt.posterior.mode
         return mode, None if self.discrepancy is None else self.discrepancy.mean(mode)
 
-    def _members(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | None]]:
+    def _members(self, count: int, seed: int) -> list[tuple[NDArray[np.float64], DiscrepancySample | NoDiscrepancy]]:
         """Unknowns and discrepancy of so many plants."""
         if (count, seed) not in self._drawn:
             draws = self.learnt.posterior.draw(count, seed)
-            errors: Sequence[DiscrepancySample | None] = [None] * count
+            errors: Sequence[DiscrepancySample | NoDiscrepancy] = [NoDiscrepancy()] * count
             if self.discrepancy:
                 seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(count)]
                 errors = self.discrepancy.samples(draws, self.learnt.scale, seeds)
@@ -138,7 +138,7 @@ class Ensemble:
         return self._drawn[count, seed]
 
     @cached_property
-    def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], DiscrepancySample | None]]]:
+    def _drawn(self) -> dict[tuple[int, int], list[tuple[NDArray[np.float64], DiscrepancySample | NoDiscrepancy]]]:
         return {}
 
 

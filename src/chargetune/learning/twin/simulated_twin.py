@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +17,13 @@ from chargetune.episode.lookup_table import LookupTable
 from chargetune.episode.score import Score
 from chargetune.episode.score_limits import ScoredLimit, Windows, limit_samples, score_limits, violation
 from chargetune.episode.stepwise import check_run, signal_indices
-from chargetune.learning.twin.discrepancy import DiscrepancySample
+from chargetune.learning.twin.discrepancy import DiscrepancySample, NoDiscrepancy
 from chargetune.learning.twin.rollout import parameters, start_state
 from chargetune.learning.twin.twin import Twin, Uncertain
 from chargetune.learning.twin.twin_loop import Member
 from chargetune.model.given import Given, actual, checked_given
 from chargetune.model.model import Model
+from chargetune.plants.sensors import Sensors
 from chargetune.plants.simulated import SimulatedPlant
 
 __all__ = ["DISCREPANCY_SHARE", "SimulatedTwin", "TwinSimulator", "default_features", "default_floor"]
@@ -34,10 +36,12 @@ DISCREPANCY_SHARE = 0.01
 
 @dataclass(frozen=True)
 class TwinSimulator:
-    """Episodes of ``steps`` intervals of ``controller`` on members of ``twin``, without noise, as one compiled function.
+    """Episodes of ``steps`` intervals of ``controller`` on members of ``twin``, as one compiled function.
 
     ``features``: outputs or inputs, one to three, with their ranges, that the discrepancy is a table over. ``given``: what the controller
-    is told, the same in each of them; the plant follows ``twin.given``.
+    is told, the same in each of them; the plant follows ``twin.given``. ``sensors``: what the estimator reads. An observer follows their
+    noise, and with it goes the plant: a limit that is kept without noise may be broken with it. The noise of a member depends on its
+    unknowns alone, so that thetas are compared under the same one; only a drawn plant has it (`Member`).
     """
 
     controller: Controller
@@ -45,10 +49,10 @@ class TwinSimulator:
     features: Mapping[str, tuple[float, float]]
     steps: int
     given: Given | None = None
+    sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
-        model = self.twin.model
-        plant = SimulatedPlant(model, self.twin.start, given=tuple(self.twin.given))
+        model, plant = self.twin.model, self._nominal
         names = tuple(dict.fromkeys((*self.controller.given_names, *self.twin.given)))
         told = checked_given(names, self._told, self.steps, self.controller.horizon)
         for name, values in self.twin.given.items():
@@ -67,19 +71,23 @@ class TwinSimulator:
         LookupTable.over(self.features, ())
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
-        """An episode of each member, None where it did not come to its end.
+        """An episode of each member with its true outputs, None where it did not come to its end.
 
-        The discrepancy and the biases of the unknowns are added to what is measured, and so to what the estimator reads.
+        The discrepancy and the biases of the unknowns are added to the model's outputs, and so to what the estimator reads.
         """
-        plants = [self.plant(unknowns) for _, unknowns, _ in members]
+        noisy = [bool(self._noise) and discrepancy is not None and discrepancy.drawn for _, _, discrepancy in members]
+        plants = [self.plant(m, noisy=own) for (_, m, _), own in zip(members, noisy, strict=True)]
         tables = [self._table(unknowns, discrepancy) for _, unknowns, discrepancy in members]
-        episodes = self._loop.run_each([theta for theta, _, _ in members], plants, tables=tables, given=self._told)
-        return [episode if episode.ending is Ending.DONE else None for episode in episodes]
+        seeds = [zlib.crc32(unknowns.tobytes()) for _, unknowns, _ in members]
+        episodes = self._loop.run_each([theta for theta, _, _ in members], plants, seeds, tables, given=self._told)
+        true, rounded = self._lookup_table.true_outputs, any(self.sensors.resolution.values())
+        out = (true(e, table) if own or rounded else e for e, table, own in zip(episodes, tables, noisy, strict=True))
+        return [episode if episode.ending is Ending.DONE else None for episode in out]
 
-    def plant(self, unknowns: NDArray[np.float64]) -> SimulatedPlant:
+    def plant(self, unknowns: NDArray[np.float64], *, noisy: bool = False) -> SimulatedPlant:
         """The twin's model with the parameters and the start of these unknowns (d,)."""
         # An ensemble goes through many thetas: its plants are made once.
-        key = unknowns.tobytes()
+        key = unknowns.tobytes(), noisy
         if key not in self._plants:
             while len(self._plants) >= PLANTS_KEPT:
                 self._plants.pop(next(iter(self._plants)))
@@ -88,7 +96,8 @@ class TwinSimulator:
             values = np.split(parameters(self.twin, unknowns), np.cumsum(list(sizes.values()))[:-1])
             start = dict(zip(model.state_names, (float(v) for v in start_state(self.twin, unknowns)), strict=True))
             own = model.with_parameters(**dict(zip(sizes, values, strict=True)))
-            self._plants[key] = SimulatedPlant(own, start, given=tuple(self.twin.given))
+            sensors = replace(self.sensors, noise_sd=self._noise if noisy else {})
+            self._plants[key] = replace(self._nominal, model=own, start=start, sensors=sensors)
         return self._plants[key]
 
     @property
@@ -96,22 +105,31 @@ class TwinSimulator:
         return dict(self.twin.given) | dict(self.given or {})
 
     @cached_property
-    def _plants(self) -> dict[bytes, SimulatedPlant]:
+    def _plants(self) -> dict[tuple[bytes, bool], SimulatedPlant]:
         return {}
 
     @cached_property
+    def _noise(self) -> dict[str, float]:
+        """That of what the estimator reads; of all else it would change nothing."""
+        read = self.controller.estimator.signals(self.controller.model)
+        return {name: sd for name, sd in self.sensors.noise_sd.items() if name in read and sd > 0}
+
+    @cached_property
+    def _nominal(self) -> SimulatedPlant:
+        return SimulatedPlant(self.twin.model, self.twin.start, replace(self.sensors, noise_sd={}), given=tuple(self.twin.given))
+
+    @cached_property
     def _loop(self) -> CompiledEpisode:
-        plant = SimulatedPlant(self.twin.model, self.twin.start, given=tuple(self.twin.given))
-        return compiled_episode(self.controller, plant, self.steps, lookup_table=self._lookup_table)
+        return compiled_episode(self.controller, self._nominal, self.steps, lookup_table=self._lookup_table)
 
     @cached_property
     def _lookup_table(self) -> LookupTable:
         return LookupTable.over(self.features, list(self.twin.noise_sd))
 
-    def _table(self, unknowns: NDArray[np.float64], discrepancy: DiscrepancySample | None) -> NDArray[np.float64]:
+    def _table(self, unknowns: NDArray[np.float64], discrepancy: DiscrepancySample | NoDiscrepancy | None) -> NDArray[np.float64]:
         biases = self.twin.biases(unknowns)
         constants = np.array([biases.get(name, 0.0) for name in self._lookup_table.outputs])[:, None]
-        return np.tile(constants, self._lookup_table.size) if discrepancy is None else discrepancy.table + constants
+        return np.tile(constants, self._lookup_table.size) + (0.0 if discrepancy is None else discrepancy.table)
 
 
 @dataclass(frozen=True)
@@ -189,7 +207,7 @@ class SimulatedTwin:
 
     @cached_property
     def _simulator(self) -> TwinSimulator:
-        return TwinSimulator(self.controller, self.twin, self.features, self.steps, self.given)
+        return TwinSimulator(self.controller, self.twin, self.features, self.steps, self.given, Sensors(self.twin.noise_sd))
 
     def score(self, episode: Episode) -> Score | None:
         return score_limits(episode, self.limits, objective=self.objective, windows=self.windows).score

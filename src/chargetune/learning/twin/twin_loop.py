@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from chargetune.episode.episode import Episode
 from chargetune.learning.closed_loop.loop import JudgedLoop
-from chargetune.learning.twin.discrepancy import DiscrepancySample
+from chargetune.learning.twin.discrepancy import DiscrepancySample, NoDiscrepancy
 from chargetune.learning.twin.twin import Twin
 
 __all__ = ["Member", "ModelledLoop", "TwinLoop"]
 
-Member = tuple[NDArray[np.float64], NDArray[np.float64], DiscrepancySample | None]
-"""One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it."""
+Member = tuple[NDArray[np.float64], NDArray[np.float64], DiscrepancySample | NoDiscrepancy | None]
+"""One closed loop: theta of the controller, unknowns of the plant, and what the twin cannot represent of it.
+
+A drawn plant has sensors with noise; the expected one, and one of given unknowns alone (None), have not."""
 
 
 class ModelledLoop(Protocol):
@@ -38,7 +40,7 @@ class TwinLoop(JudgedLoop, ModelledLoop, Protocol):
     """The user's closed loop on the twin: what is unknown of the plant, and an episode of any plant of that kind."""
 
     def simulate(self, members: Sequence[Member]) -> list[Episode | None]:
-        """A noise-free episode of each member, None where it fails; its discrepancy is added to the measured outputs."""
+        """An episode of each member with its true outputs, discrepancy included; None where it fails. Noise is read, not returned."""
         ...
 
     def violation(self, episode: Episode) -> float:
