@@ -14,6 +14,8 @@ from study_text import study_text
 pytestmark = pytest.mark.usefixtures("virtual_machine")
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+# A study of the black box on an electrochemical cell.
+RELEASED = Path(__file__).parents[1] / "battery" / "studies" / "data" / "released"
 
 
 def test_identify_writes_a_cell_that_a_study_takes(shared, tmp_path):
@@ -86,13 +88,14 @@ def test_the_electrochemical_examples_are_what_they_say(file):
     assert problem.plant.model == "DFN"
     assert {limit.name: limit.kind for limit in problem.limits_by_name.values()}["anode_min_V"] == "scored"
     assert problem.sensors.noise_sd == {"voltage_V": 0.002}
-    assert problem.estimator.kalman is not None
+    assert problem.estimator.kind == "offset_free"
+    assert problem.range is not None
     cold = "cold" in file
     assert problem.plant.ambient_K == (283.15 if cold else 298.15)
 
 
 def test_tuning_an_electrochemical_plant_resumes_and_draws(tmp_path):
-    text = (EXAMPLES / "dfn_fast_charge.toml").read_text().replace('"DFN"\n', '"SPM"\n').replace("steps = 360", "steps = 40")
+    text = (RELEASED / "dfn_fast_charge.toml").read_text().replace('"DFN"\n', '"SPM"\n').replace("steps = 360", "steps = 40")
     (tmp_path / "okane2022.toml").write_text((EXAMPLES / "okane2022.toml").read_text())
     (tmp_path / "spm.toml").write_text(text)
     command = "tune", tmp_path / "spm.toml", "--store", tmp_path / "s.sqlite", "--json"

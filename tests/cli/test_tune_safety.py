@@ -109,7 +109,7 @@ def test_what_is_unknown_of_the_plant_is_told_to_the_twin(tmp_path):
 def test_a_limit_that_the_twin_cannot_predict_is_not_promised(tmp_path):
     study = tmp_path / "plated.toml"
     example = Path(__file__).parents[2] / "examples"
-    text = (example / "dfn_fast_charge.toml").read_text().replace('tuner = "default"', 'tuner = "twin"')
+    text = (example / "dfn_fast_charge.toml").read_text().replace('tuner = "range"', 'tuner = "twin"')
     study.write_text(text.replace('"okane2022.toml"', f'"{example / "okane2022.toml"}"') + "\n[safety]\nprobability = 0.9\n")
     config = load_config(study)
     problem = config.problem(tmp_path)

@@ -44,7 +44,11 @@ def test_there_are_examples():
 
 # What is true of an example and belongs to it: a stage cost that is learnt need not be convex; in the cold an hour does not fill the
 # cell, and what theta has near full is not met.
-TOLD = {"rbf_charge": ["non-convex"], "dfn_fast_charge_cold": ["no-influence", "unreachable-target"]}
+TOLD = {
+    "rbf_charge": ["non-convex"],
+    "dfn_fast_charge": ["no-influence"],
+    "dfn_fast_charge_cold": ["no-influence", "unreachable-target"],
+}
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
