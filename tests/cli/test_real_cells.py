@@ -82,16 +82,13 @@ def test_compare_refuses_before_it_charges(tmp_path, refused):
     assert "nothing.sqlite" in refused("compare", tmp_path / "quick.toml", "--store", tmp_path / "nothing.sqlite")
 
 
-@pytest.mark.parametrize("file", ["dfn_fast_charge.toml", "dfn_fast_charge_cold.toml"])
-def test_the_electrochemical_examples_are_what_they_say(file):
-    problem = load_config(EXAMPLES / file).problem(EXAMPLES)
+def test_the_electrochemical_example_is_what_it_says():
+    problem = load_config(EXAMPLES / "dfn_fast_charge.toml").problem(EXAMPLES)
     assert problem.plant.model == "DFN"
     assert {limit.name: limit.kind for limit in problem.limits_by_name.values()}["anode_min_V"] == "scored"
     assert problem.sensors.noise_sd == {"voltage_V": 0.002}
     assert problem.estimator.kind == "offset_free"
     assert problem.range is not None
-    cold = "cold" in file
-    assert problem.plant.ambient_K == (283.15 if cold else 298.15)
 
 
 def test_tuning_an_electrochemical_plant_resumes_and_draws(tmp_path):
