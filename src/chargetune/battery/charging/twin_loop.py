@@ -125,7 +125,7 @@ class ChargingTwin:
     def _simulator(self) -> TwinSimulator:
         from chargetune.learning.twin.simulated_twin import TwinSimulator
 
-        # A bias is not known of a cell; what may be unknown so is an unknown of the twin.
+        # The bias of a sensor is not known; it may be an unknown of the twin.
         sensors = replace(self.problem.sensors.sensors(), bias={})
         return TwinSimulator(self.controller, self.twin, self.features, self.problem.episode.steps, sensors=sensors)
 
